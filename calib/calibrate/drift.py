@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -21,8 +20,10 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
+from calib.geometry.covariance import JOINT_NAMES, pixel_rates
+from calib.geometry.parameters import focus_and_turn_rates, parameter_names
 from calib.geometry.rig import Rig
-from calib.geometry.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
+from calib.geometry.rigid import FloatArray, rigid_rates
 from calib.geometry.significance import MEDIAN_OF_TWO, chance, sigmas
 from calib.matching.patch import match_patch
 from calib.matching.verdict import MatchSettings
@@ -54,7 +55,6 @@ _RANGE_M = 5.0
 _SETTINGS = MatchSettings(half_px=14, roughness=0.0)
 
 _TUKEY = 4.0
-_BIT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,37 +232,20 @@ def _columns(rig: Rig, shifts: Sequence[ViewShift]) -> dict[str, FloatArray]:
 
 def _responses(rig: Rig, shift: ViewShift) -> dict[str, FloatArray]:
     """By number that may change: how a view's four numbers, taken from its own features, follow it."""
-    model, changed = _changed(rig, shift.camera, shift.pan_rad, shift.tilt_rad)
-    pixels = shift.pixels_px
-    rays = model.ray(pixels)
+    camera = rig.cameras[shift.camera]
+    rays = rig.camera_in_rover(shift.camera, shift.pan_rad, shift.tilt_rad).ray(shift.pixels_px)
     points = rays.origins_m + _ranges_m(rays.origins_m, rays.directions)[:, None] * rays.directions
-    rates = _rates(pixels, model.size_px).reshape(-1, 4)
-    moved_px = [np.nan_to_num(other.project(points)[0] - pixels).ravel() / _BIT for other in changed.values()]
-    numbers = np.linalg.lstsq(rates, np.column_stack(moved_px), rcond=None)[0]
-    return {name: np.asarray(numbers[:, k], dtype=np.float64) for k, name in enumerate(changed)}
-
-
-@lru_cache(maxsize=1024)
-def _changed(
-    rig: Rig, camera: str, pan_rad: float, tilt_rad: float
-) -> tuple[CameraModel, dict[str, CameraModel]]:
-    """A camera in the rover, and by number that may change: as it is after a bit of that."""
-    model = rig.camera_in_rover(camera, pan_rad, tilt_rad)
-    changed = {
-        "pan": rig.camera_in_rover(camera, pan_rad + _BIT, tilt_rad),
-        "tilt": rig.camera_in_rover(camera, pan_rad, tilt_rad + _BIT),
-    }
-    for axis, turn in zip("xyz", (rot_x, rot_y, rot_z), strict=True):
-        changed[f"rover.{axis}"] = model.moved(Rigid(turn(_BIT), np.zeros(3)))
-    held = rig.cameras[camera]
-    if held.on == "head":
-        in_head = {
-            f"turn.{axis}": held.model.turned(_BIT * row) for axis, row in zip("xyz", np.eye(3), strict=True)
-        }
-        for part, moved in (in_head | {"scale": held.model.zoomed(_BIT)}).items():
-            joined = replace(rig, cameras={camera: replace(held, model=moved)}, stereo={})
-            changed[f"cameras.{camera}.{part}"] = joined.camera_in_rover(camera, pan_rad, tilt_rad)
-    return model, changed
+    own = [f"cameras.{shift.camera}.{part}" for part in parameter_names(camera.model.kind)]
+    seen = pixel_rates(rig, (*JOINT_NAMES, *own), shift.camera, shift.pan_rad, shift.tilt_rad, points)
+    # The rover carries the camera: points move the other way before it.
+    by_rover = -rigid_rates(seen.to_points, points, np.zeros(3))[..., :3]
+    names, moved_px = ["pan", "tilt", *(f"rover.{axis}" for axis in "xyz")], [seen.to_rig[..., :2], by_rover]
+    if camera.on == "head":
+        names += [f"cameras.{shift.camera}.{part}" for part in ("scale", "turn.x", "turn.y", "turn.z")]
+        moved_px.append(seen.to_rig[..., 2:] @ focus_and_turn_rates(camera.model))
+    by_number = np.nan_to_num(np.concatenate(moved_px, axis=2)).reshape(-1, len(names))
+    rates = _rates(shift.pixels_px, camera.model.size_px).reshape(-1, 4)
+    return dict(zip(names, np.linalg.lstsq(rates, by_number, rcond=None)[0].T, strict=True))
 
 
 def _ranges_m(origins_m: FloatArray, directions: FloatArray) -> FloatArray:
