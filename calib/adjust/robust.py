@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -87,6 +88,11 @@ class Weighed:
         """By kind what stated sigmas count times."""
         return {c.kind: c.weighed for c in self.components}
 
+    @cached_property
+    def scored(self) -> ScoredFit:
+        """What hypotheses are tested by."""
+        return ScoredFit(self.problem, self.fit.state)
+
 
 def weighed_fields(
     survey: Survey,
@@ -126,7 +132,7 @@ def weighed_fields(
         "components": weighed.components,
         "outliers": name_outliers(problem, state, covariance, weighed.images),
         "degenerate": open_directions(problem, covariance),
-        "contradictions": find_contradictions(ScoredFit(problem, state)),
+        "contradictions": find_contradictions(weighed.scored),
     }
 
 

@@ -178,7 +178,7 @@ def _calibration(
 
 def _wider(cleaned: Cleaned, weighed: Weighed) -> tuple[Finding, ...]:
     """What hypotheses would gain, those first that explain why sigmas had to be widened beyond scatter."""
-    found = survey_findings(ScoredFit(weighed.problem, weighed.fit.state))
+    found = survey_findings(weighed.scored)
     if not any(component.wrong for component in weighed.components):
         return found
     causes = explaining(survey_findings(ScoredFit(cleaned.problem, cleaned.fit.state)), weighed.excess)

@@ -220,12 +220,11 @@ def _calibration(
     fields = weighed_fields(
         bench.survey, cleaned.as_stated(), weighed, images, checks, kinds, Level.PREDICTED, bench.notes
     )
-    fields["outliers"] += bench.wrong
     return BenchCalibration(
         **fields,
         terms=_gains(bench, chosen, tests, weighed),
         gauges=_gauges(bench, chosen),
-        drifts=find_drifts(ScoredFit(problem, state)),
+        drifts=find_drifts(weighed.scored),
         joint_rad=problem.joint_rad,
         inexact_m=print_error_m(problem, state),
         bows_m=state.bows_m,

@@ -130,7 +130,7 @@ class BenchProblem:
     def __init__(self, survey: Survey, options: BenchOptions) -> None:
         self.survey, self.options = survey, options
         terms = bench_terms(survey)
-        wrong, self.wrong = wrong_dots(terms.checks)
+        wrong, _ = wrong_dots(terms.checks)
         checks = tuple(t.only(~wrong[t.name]) if t.name in wrong else t for t in terms.checks)
         self.terms = replace(terms, checks=checks)
         self.notes = list(self.terms.notes)
