@@ -14,7 +14,7 @@ most of the other's work, and a fit with the wrong one alone would be sure of nu
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -34,16 +34,12 @@ Kind = Literal["harmonic 1", "harmonic 2", "backlash", "offset", "twist", "bow"]
 
 @dataclass(frozen=True)
 class ModelTerm:
-    """A part of the model: its kind, and what it is of (a joint, ``axis``, a board).
-
-    ``numbers`` are its places among ``JOINTS_NAMES`` (a joint's), ``MAST_NAMES`` (the axes') or a bow's two,
-    ``parameters`` their names.
-    """
+    """A part of the model: its kind, what it is of (``pan``, ``tilt``, ``axis`` or a board), and the places
+    of its numbers among ``JOINTS_NAMES`` (a joint's), ``MAST_NAMES`` (the axes') or a bow's two."""
 
     kind: Kind
     of: str
     numbers: tuple[int, ...]
-    parameters: tuple[str, ...]
 
     @property
     def name(self) -> str:
@@ -51,48 +47,44 @@ class ModelTerm:
         return f"bow of {self.of}" if self.kind == "bow" else f"{self.of} {self.kind}"
 
     @property
+    def unknown(self) -> str:
+        """The kind of unknowns (``calib.adjust.unknowns``) that its numbers belong to."""
+        return {"bow": "bow", "offset": "mast", "twist": "mast"}.get(self.kind, "joints")
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Its numbers' names."""
+        if self.kind == "bow":
+            return tuple(f"board {self.of}.bow_m.{axis}" for axis in "xy")
+        joint = self.unknown == "joints"
+        return tuple(JOINTS_NAMES[i] if joint else f"mast.{MAST_NAMES[i]}" for i in self.numbers)
+
+    @property
     def group(self) -> tuple[str, str]:
         """Terms of one group enter together or not at all."""
         return "harmonic" if self.kind in ("harmonic 1", "harmonic 2") else self.kind, self.of
 
 
-def _by_name(terms: Iterable[ModelTerm]) -> dict[str, ModelTerm]:
-    return {term.name: term for term in terms}
-
-
-def _joint_term(kind: Kind, joint: int, numbers: tuple[int, ...]) -> ModelTerm:
-    """A term of one joint by which of its numbers (``AXIS_NAMES``) it has."""
-    places = tuple(joint * len(AXIS_NAMES) + number for number in numbers)
-    return ModelTerm(kind, ("pan", "tilt")[joint], places, tuple(JOINTS_NAMES[i] for i in places))
-
-
-def _axis_term(kind: Kind, place: int) -> ModelTerm:
-    """A term of the axes."""
-    return ModelTerm(kind, "axis", (place,), (f"mast.{MAST_NAMES[place]}",))
-
-
-_JOINT_KINDS: tuple[tuple[Kind, tuple[int, ...]], ...] = (
-    ("harmonic 1", (0, 1)), ("harmonic 2", (2, 3)), ("backlash", (4,)),
-)  # fmt: skip
-JOINT_TERMS = _by_name(
-    _joint_term(kind, joint, numbers) for joint in (0, 1) for kind, numbers in _JOINT_KINDS
-)
-AXIS_TERMS = _by_name((_axis_term("offset", 6), _axis_term("twist", 7)))
-TERM_KINDS = ("joints", "mast", "bow")
-"""The kinds of unknowns (``calib.adjust.unknowns``) that terms are numbers of."""
-
 HIDDEN_PX = 0.1
 """The error that a term left out may hide, one sigma, rms: half that of a person's click."""
 
 
-def bow_of(board: str) -> ModelTerm:
-    """Return the term of a board that is not flat."""
-    return ModelTerm("bow", board, (0, 1), tuple(f"board {board}.bow_m.{a}" for a in "xy"))
-
-
 def candidate_terms(boards: Sequence[str]) -> dict[str, ModelTerm]:
     """Return the terms that a model of some boards may have, by name."""
-    return {**JOINT_TERMS, **AXIS_TERMS, **_by_name(bow_of(board) for board in boards)}
+    terms = []
+    for first, joint in ((0, "pan"), (len(AXIS_NAMES), "tilt")):
+        terms += [
+            ModelTerm("harmonic 1", joint, (first, first + 1)),
+            ModelTerm("harmonic 2", joint, (first + 2, first + 3)),
+            ModelTerm("backlash", joint, (first + 4,)),
+        ]
+    terms += [ModelTerm("offset", "axis", (6,)), ModelTerm("twist", "axis", (7,))]
+    return {term.name: term for term in (*terms, *(ModelTerm("bow", board, (0, 1)) for board in boards))}
+
+
+def term_numbers(terms: Mapping[str, ModelTerm], unknown: str) -> list[int]:
+    """Return the places of all numbers that some terms have of a kind of unknowns."""
+    return sorted(number for term in terms.values() if term.unknown == unknown for number in term.numbers)
 
 
 def entering_together(terms: Iterable[ModelTerm]) -> list[tuple[str, ...]]:
@@ -172,13 +164,13 @@ class TermGain:
 
 def choose_terms(
     problem: Adjustment, fit: Minimum[Estimate], terms: Mapping[str, ModelTerm]
-) -> tuple[tuple[str, ...], dict[str, TermGain]]:
+) -> tuple[dict[str, ModelTerm], dict[str, TermGain]]:
     """Return which of the terms that were fitted are needed, and how each one does beside these."""
     covariance = covariance_of(fit.normal.matrix, problem.weak)
     total, freedom = goodness(problem, fit.state, covariance)
     freedom = max(freedom, 1.0)
     scale = total / freedom
-    values = problem.values(fit.state, *TERM_KINDS)
+    values = problem.values(fit.state, "joints", "mast", "bow")
     places, numbers = dict[str, list[int]](), list[str]()
     for name, term in terms.items():
         places[name] = list(range(len(numbers), len(numbers) + len(term.parameters)))
@@ -190,7 +182,7 @@ def choose_terms(
     def is_play(group: Sequence[str]) -> bool:
         return terms[group[0]].kind == "backlash"
 
-    def tested(group: Sequence[str], beside: Sequence[str]) -> TermGain:
+    def tested(group: Sequence[str], beside: Collection[str]) -> TermGain:
         """The test of a group in the model of itself and some other terms."""
         mine = [i for term in group for i in places[term]]
         gone = [i for term, own in places.items() if term not in group and term not in beside for i in own]
@@ -221,7 +213,7 @@ def choose_terms(
         if not needless:
             break
         kept.remove(max(needless, key=lambda group: (tests[group].chance, -tests[group].chi2)))
-    chosen = tuple(term for term in terms if any(term in group for group in kept))
+    chosen = {name: term for name, term in terms.items() if any(name in group for group in kept)}
     found = {}
     for name, term in terms.items():
         found[name] = tested((name,), chosen)
@@ -230,16 +222,6 @@ def choose_terms(
             found[name] = replace(found[name], chi2=alone.chi2, chance=alone.chance)
         found[name] = replace(found[name], entered=name in chosen)
     return chosen, found
-
-
-def joint_numbers(chosen: Iterable[str]) -> list[int]:
-    """Return which of the ten numbers of ``calib.geometry.rig.JOINTS_NAMES`` some terms have."""
-    return sorted(number for term in chosen if term in JOINT_TERMS for number in JOINT_TERMS[term].numbers)
-
-
-def axis_numbers(chosen: Iterable[str]) -> list[int]:
-    """Return which of the mast's eight numbers some terms have."""
-    return sorted(number for term in chosen if term in AXIS_TERMS for number in AXIS_TERMS[term].numbers)
 
 
 def _motion(
@@ -263,7 +245,7 @@ def _motion(
             count += len(rates)
     found /= max(count, 1)
     for group in entering_together(terms.values()):
-        if group[0] in JOINT_TERMS:
+        if terms[group[0]].unknown == "joints":
             mine = [i for term in group for i in places[term]]
             found[np.ix_(mine, mine)] = _by_joint(problem, state, [terms[term] for term in group])
     return found

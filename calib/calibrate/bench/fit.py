@@ -10,7 +10,7 @@ Start (``calib.calibrate.starts.bench``), pulls bounded, what changed half-way f
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from calib.adjust.adjustment import HUBER, SCAN_HUBER, Adjustment
 from calib.adjust.gross import gross_limit
 from calib.adjust.hypotheses import ScoredFit, find_change, find_drifts
-from calib.adjust.model_terms import TermGain, candidate_terms, choose_terms
+from calib.adjust.model_terms import ModelTerm, TermGain, choose_terms
 from calib.adjust.result import BenchCalibration
 from calib.adjust.robust import (
     Cleaned,
@@ -83,7 +83,8 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     _refuse_far(bench, problem, start)  # before blunders are looked for one by one where nothing fits
     cleaned = without_blunders(problem, start, bench.terms.images, bench.survey.sigma.corner_px)
     chosen, tests = choose_terms(cleaned.problem, cleaned.fit, candidates)
-    start = without_terms(cleaned.fit.state, set(candidates) - set(chosen))
+    dropped = {name: term for name, term in candidates.items() if name not in chosen}
+    start = without_terms(cleaned.fit.state, dropped)
     last = bench.problem(chosen, start).with_terms(cleaned.problem.images, ())
     cleaned = judged_again(cleaned, last, start)
     _refuse_part(cleaned.problem)
@@ -95,7 +96,7 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
 
 
 def _look_for_changes(
-    bench: BenchProblem, chosen: Collection[str]
+    bench: BenchProblem, chosen: Mapping[str, ModelTerm]
 ) -> tuple[BenchProblem, Adjustment, Estimate]:
     """Return the bench, its problem with some terms, lone wrong corners left out, and its fit.
 
@@ -202,7 +203,7 @@ def _calibration(
     bench: BenchProblem,
     cleaned: Cleaned,
     weighed: Weighed,
-    chosen: Sequence[str],
+    chosen: Mapping[str, ModelTerm],
     tests: Mapping[str, TermGain],
     began: float,
 ) -> BenchCalibration:
@@ -220,9 +221,11 @@ def _calibration(
     fields = weighed_fields(
         bench.survey, cleaned.as_stated(), weighed, images, checks, kinds, Level.PREDICTED, bench.notes
     )
+    beside = choose_terms(problem, weighed.fit, chosen)[1]  # those of the model beside one another
+    beside = {name: replace(gain, entered=True) for name, gain in beside.items()}
     return BenchCalibration(
         **fields,
-        terms=_gains(bench, chosen, tests, weighed),
+        terms=tuple({**tests, **beside}.values()),
         gauges=_gauges(bench, chosen),
         drifts=find_drifts(weighed.scored),
         joint_rad=problem.joint_rad,
@@ -232,17 +235,7 @@ def _calibration(
     )
 
 
-def _gains(
-    bench: BenchProblem, chosen: Sequence[str], tests: Mapping[str, TermGain], weighed: Weighed
-) -> tuple[TermGain, ...]:
-    """Every term with what it gains; those of the model beside one another."""
-    every = candidate_terms(bench.boards)
-    _, gains = choose_terms(weighed.problem, weighed.fit, {name: every[name] for name in chosen})
-    entered = {name: replace(gain, entered=True) for name, gain in gains.items()}
-    return tuple({**tests, **entered}.values())
-
-
-def _gauges(bench: BenchProblem, chosen: Sequence[str]) -> tuple[str, ...]:
+def _gauges(bench: BenchProblem, chosen: Collection[str]) -> tuple[str, ...]:
     """What pictures cannot know, and how it was fixed."""
     known = bench.options.rover_from_board
     if known is not None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.adjust.adjustment import HUBER, Adjustment
-from calib.adjust.model_terms import ModelTerm, axis_numbers, bow_of, candidate_terms, joint_numbers
+from calib.adjust.model_terms import ModelTerm, candidate_terms, term_numbers
 from calib.adjust.terms import ImageTerm, with_kept
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.bench import BenchNotFitted, BenchStart, SomethingChanged, bench_start
@@ -239,22 +239,22 @@ class BenchProblem:
             boards[known[0]] = known[1]
         return replace(state, cameras=cameras, mast=mast, rover_from_board=boards)
 
-    def problem(self, chosen: Collection[str], state: Estimate) -> Adjustment:
+    def problem(self, chosen: Mapping[str, ModelTerm], state: Estimate) -> Adjustment:
         """The least-squares problem with some terms."""
         known = self.options.rover_from_board
         return Adjustment(
             with_kept(self.terms.images, self.doubtful),
             (),
             state,
-            mast_parameters=[*(() if known is None else range(6)), *axis_numbers(chosen)],
+            mast_parameters=[*(() if known is None else range(6)), *term_numbers(chosen, "mast")],
             joint_rad=self.joint_rad,
-            joint_errors=joint_numbers(chosen),
-            bowed=[b for b in self.boards if bow_of(b).name in chosen],
+            joint_errors=term_numbers(chosen, "joints"),
+            bowed=[term.of for term in chosen.values() if term.kind == "bow"],
             fixed=() if known is None else (known[0],),
             huber=HUBER,
         )
 
-    def seen(self, chosen: Collection[str], start: Estimate) -> Adjustment:
+    def seen(self, chosen: Mapping[str, ModelTerm], start: Estimate) -> Adjustment:
         """The problem without images whose corners have no pixel at the start."""
         problem = self.problem(chosen, start)
         return problem.with_terms(with_kept(problem.images, problem.unseen(start)), ())
@@ -291,10 +291,10 @@ def best_cut(there: np.ndarray) -> tuple[int, int]:
     return int(np.argmin(wrong)), int(min(wrong))
 
 
-def without_terms(state: Estimate, terms: set[str]) -> Estimate:
+def without_terms(state: Estimate, terms: Mapping[str, ModelTerm]) -> Estimate:
     """Return the state with some terms' numbers at nothing."""
     mast, errors = state.mast.copy(), state.joint_errors.copy()
-    mast[axis_numbers(terms)] = 0.0
-    errors[joint_numbers(terms)] = 0.0
-    bows = {b: np.zeros(2) if bow_of(b).name in terms else bow for b, bow in state.bows_m.items()}
+    mast[term_numbers(terms, "mast")] = 0.0
+    errors[term_numbers(terms, "joints")] = 0.0
+    bows = {**state.bows_m, **{term.of: np.zeros(2) for term in terms.values() if term.kind == "bow"}}
     return replace(state, mast=mast, joint_errors=errors, bows_m=bows)
