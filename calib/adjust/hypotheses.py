@@ -1,13 +1,13 @@
 """What a fit's residuals would gain by: one table of hypotheses, for surveys and for benches.
 
 Each hypothesis has numbers beside the fitted ones, all 0 in the fit: of the mast's axes, of a joint's errors
-around the turn, of a joint that slips or is read wrong once, of a lens, of a camera that changes between two
-pictures, of joints and cameras that drift from the first picture to the last, of a board's shape, of a board
-that moved, of a placement whose pictures say something else of cameras and axes than the others. Near the fit
-the problem is linear, so that the gain in chi-square follows from sums over pictures (`calib.adjust.score`),
-and no further fit is made. Surveys and benches differ only in what is tested. Where one defect shows in
-several hypotheses, the one that gains most for its numbers is the likeliest. A pan that slips between two
-placements of a bench's board is seen by nothing and does no harm.
+around the turn, of a joint that slips, of a lens, of a camera that changes between two pictures, of joints
+and cameras that drift from the first picture to the last, of a board's shape, of a board that moved, of a
+placement whose pictures say something else of cameras and axes than the others. Near the fit the problem is
+linear, so that the gain in chi-square follows from sums over pictures (`calib.adjust.score`), and no further
+fit is made. Surveys and benches differ only in what is tested. Where one defect shows in several hypotheses,
+the one that gains most for its numbers is the likeliest. A pan that slips between two placements of a bench's
+board is seen by nothing and does no harm.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ boards to the rover: tapes show a slip that sharp images alone leave to their bo
 LARGEST = 0.5
 """Radians, or part of the focal length: what is larger is no slip, knock or other focus."""
 
-Course = Literal["always", "once", "each", "from", "drift"]
+Course = Literal["always", "once", "each", "from"]
 Rates = Callable[[ImageTerm, Motions], FloatArray]
 
 
@@ -80,9 +80,9 @@ class Effect:
         """Return the same for some of its numbers."""
         return replace(self, rates=self.rates[:, numbers], moves_px=self.moves_px[:, numbers])
 
-    def weight(self, course: Course) -> float:
-        """What part of its numbers a course has reached."""
-        return self.elapsed if course == "drift" else 1.0
+    def drifting(self) -> Effect:
+        """Return the same for numbers that grow from nothing with every picture."""
+        return replace(self, rates=self.elapsed * self.rates, moves_px=self.elapsed * self.moves_px)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,10 +92,9 @@ class Hypothesis:
     Attributes
     ----------
     name
-        ``mast``, ``harmonics of pan``, ``slip of tilt``, ``drift of tilt``, ``attitude``,
-        ``joint readings``, ``lens of CAMERA``, ``change of CAMERA``, ``drift of CAMERA``,
-        ``bow of the board``, ``spacing of the board``, ``board moved``, ``placement P of BOARD`` or
-        ``drawing`` (of the prisms).
+        ``mast``, ``harmonics of pan``, ``slip of tilt``, ``drift of tilt``, ``joint readings``,
+        ``lens of CAMERA``, ``change of CAMERA``, ``drift of CAMERA``, ``bow of the board``,
+        ``spacing of the board``, ``board moved``, ``placement P of BOARD`` or ``drawing`` (of the prisms).
     subject
         ``("joint", NAME)``, ``("camera", NAME)`` or ``("board", NAME, PLACEMENT)``, where it is one's.
     rows
@@ -103,8 +102,8 @@ class Hypothesis:
     sentence
         What a finding of it says.
     course
-        When it is so: ``always``, in one of the groups (``once``), in each by numbers of its own, from some
-        group on, or more with every picture (``drift``).
+        When it is so: ``always``, in one of the groups (``once``), in each by numbers of its own, or from
+        some group on.
     side
         Groups at least on either side of a change.
     """
@@ -213,10 +212,9 @@ def _each_tested(fit: ScoredFit, hypotheses: Iterator[Hypothesis]) -> tuple[Find
 def find_change(fit: ScoredFit) -> Finding | None:
     """Return the change between two pictures that explains most, or None if none is significant.
 
-    The fit is one with pulls bounded. For every picture from which on a board may have
-    stood elsewhere, a joint read otherwise, or a camera had another focal length or another direction, the
-    gain is found. Of changes that explain the same, that with the fewest numbers is reported; none where axes
-    of the mast that do not meet at a right angle explain more.
+    The fit is one with pulls bounded. A board may have stood elsewhere, a joint read otherwise, or a camera
+    had another focal length and direction from any picture on. Of changes that explain the same, that with
+    the fewest numbers is reported; none where axes of the mast that do not meet squarely explain more.
     """
     tried = [(what, at, gain) for what in _changes(fit) for at, gain in fit.gains(what)]
     possible = [one for one in tried if one[2].chi2 < fit.chi2]
@@ -298,12 +296,9 @@ class ScoredFit:
 
     def gains(self, what: Hypothesis) -> list[tuple[int, Gain]]:
         """What a hypothesis gains, by the group at which it is so, or from which on."""
-        weights = [row.elapsed if what.course == "drift" else 1.0 for row in what.rows]
         fitted = len(self.gradient)
-        if what.course in ("always", "drift"):
-            measured = [
-                (row.block, weight * row.rates) for row, weight in zip(what.rows, weights, strict=True)
-            ]
+        if what.course == "always":
+            measured = [(row.block, row.rates) for row in what.rows]
             return [(0, self._gain(Score.of(measured, fitted)))] if measured else []
         scores = [Score.of(((row.block, row.rates) for row in group), fitted) for group in what.groups]
         if what.course == "once":
@@ -339,7 +334,7 @@ class ScoredFit:
     def finding(self, what: Hypothesis, at: int, gain: Gain, tries: int) -> Finding:
         """What a hypothesis says with its gain at some of its groups, the best of so many tries."""
         scale = self.left(gain)
-        if what.subject[:1] == ("joint",) and what.course in ("from", "drift"):
+        if what.subject[:1] == ("joint",):
             scale = max(scale, self._scatter(what.rows, gain.chi2))
         likely = chance(gain.chi2, gain.freedom, scale, self.freedom)
         before = what.groups[at - 1][-1].name if what.course == "from" else ""
@@ -375,7 +370,7 @@ def _size_px(what: Hypothesis, at: int, values: FloatArray) -> float:
         moved = [row.moves_px @ v for group, v in zip(groups, own, strict=True) for row in group]
     else:
         some = {"once": groups[at : at + 1], "from": groups[at:]}.get(what.course, groups)
-        moved = [row.weight(what.course) * (row.moves_px @ values) for group in some for row in group]
+        moved = [row.moves_px @ values for group in some for row in group]
     every = np.concatenate(moved)
     return float(np.sqrt(np.mean(every**2))) if len(every) else float("nan")
 
@@ -397,8 +392,11 @@ def _of_surveys(fit: ScoredFit) -> Iterator[Hypothesis]:
 
 def _drifts(fit: ScoredFit) -> Iterator[Hypothesis]:
     """Joints and cameras that change more with every picture."""
-    yield from _joints(fit, "drift", "drift", _joint_drift_sentence)
-    yield from _cameras(fit, "drift", "drift", _camera_drift_sentence)
+    for what in (
+        *_joints(fit, "drift", "always", _joint_drift_sentence),
+        *_cameras(fit, "drift", "always", _camera_drift_sentence),
+    ):
+        yield replace(what, rows=[row.drifting() for row in what.rows])
 
 
 def _placements(fit: ScoredFit) -> Iterator[Hypothesis]:
@@ -486,21 +484,13 @@ def _harmonics(fit: ScoredFit) -> Iterator[Hypothesis]:
 
 
 def _readings(fit: ScoredFit) -> Iterator[Hypothesis]:
-    """Readings that are off all, or once."""
+    """Readings that are all off."""
 
-    def every(found: Finding) -> str:
+    def sentence(found: Finding) -> str:
         rms = 1e3 * float(np.sqrt(np.mean(found.values**2)))
         return f"joint readings scatter by some {rms:.2g} mrad more than joint_rad in survey.yaml says"
 
-    def one(found: Finding) -> str:
-        pan, tilt = 1e3 * found.values
-        return (
-            f"at image {found.after} the head was elsewhere than read, by {pan:+.2f} mrad in pan and "
-            f"{tilt:+.2f} in tilt"
-        )
-
-    yield Hypothesis("joint readings", (), fit.readings, every, "each")
-    yield Hypothesis("attitude", (), fit.readings, one, "once")
+    yield Hypothesis("joint readings", (), fit.readings, sentence, "each")
 
 
 def _lenses(fit: ScoredFit) -> Iterator[Hypothesis]:
