@@ -9,7 +9,6 @@ from __future__ import annotations
 import errno
 import hashlib
 import os
-import select
 import stat
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -31,7 +30,6 @@ LARGEST_IMAGE_PX = 65536
 BLIND_GRID = (38, 31)
 #: A lens with no ray in more than this part of its image is refused; a fisheye's corners often have none.
 MOST_BLIND = 0.5
-SILENT_S = 10.0
 JPEG_SCAN = 0xDA
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
@@ -40,18 +38,10 @@ JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 class CameraFile:
     """One camera as a file holds it.
 
-    Attributes
-    ----------
-    model
-        The camera model, in ``frame``.
-    frame
-        Name of the frame of the model's vectors; ``unknown`` where the format has no place for it.
-    fit, provenance
-        Carried through unread; a covariance in ``fit`` names its parameter order.
-    notes
-        Sentences for the user: what was changed on reading, what was not read.
-    path, digest
-        Where it was read and the SHA-256 of the bytes read; None and empty for one made in the program.
+    ``frame`` names the frame of the model's vectors, ``unknown`` where the format has no place for it.
+    ``fit`` and ``provenance`` are carried through unread; a covariance in ``fit`` names its parameter order.
+    ``notes`` are sentences for the user: what was changed on reading, what was not read. ``path`` and
+    ``digest``, the SHA-256 of the bytes read, are None and empty for one made in the program.
     """
 
     model: CameraModel
@@ -68,26 +58,12 @@ class CameraFile:
 
 
 def read_bytes(path: str | Path, limit_bytes: int) -> bytes:
-    """Return the whole file, or raise BadFile if it cannot be read, is empty, or is larger than the limit.
-
-    A pipe without a writer is empty; one whose writer says nothing is waited for `SILENT_S` seconds.
-    """
-    data = b""
+    """Return the whole file, or raise BadFile if it cannot be read, is empty, or is larger than the limit."""
     try:
-        with open(
-            path, "rb", buffering=0, opener=lambda name, how: os.open(name, how | os.O_NONBLOCK)
-        ) as file:
-            more = select.poll()
-            more.register(file, select.POLLIN)
-            while len(data) <= limit_bytes and (part := file.read(limit_bytes + 1 - len(data))) != b"":
-                data += part or b""
-                if part is None and not more.poll(1000.0 * SILENT_S):
-                    silent = f"is a pipe or a device that has sent nothing for {SILENT_S:g} s"
-                    raise BadFile(path, "", f"{silent}; a plain file is expected")
-    except OSError as error:
-        raise BadFile(path, "", f"cannot be read: {error.strerror or error}") from None
-    except ValueError as error:  # a path with a NUL
-        raise BadFile(path, "", f"cannot be read: {error}") from None
+        with open_plain(path) as file:
+            data = file.read(limit_bytes + 1)
+    except (OSError, ValueError) as error:  # a path with a NUL is a ValueError
+        raise BadFile(path, "", f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if len(data) > limit_bytes:
         raise BadFile(path, "", f"is larger than {limit_bytes} bytes, the most that is read")
     if not data:
@@ -156,19 +132,9 @@ def build_model(
 ) -> tuple[CameraModel, tuple[str, ...]]:
     """Return the camera model of numbers read from a file, A and O normalised, with the notes to report.
 
-    Parameters
-    ----------
-    path, place
-        For messages: the file, and the key or group of the camera in it.
-    kind, size_px, cahvore_type, linearity
-        As in `calib.geometry.cahvor.CameraModel`; ``linearity`` None where the type fixes it.
-    vectors
-        C, A, H, V and, as the kind needs, O, R, E, each (3,).
-
-    Raises
-    ------
-    BadFile
-        If the numbers are no camera: not finite, beyond 1e9, A or O zero, A H V in one plane.
+    ``path`` and ``place`` are for messages. ``vectors`` are C, A, H, V and, as the kind needs, O, R, E, each
+    (3,); ``linearity`` is None where the type fixes it. Raises BadFile if the numbers are no camera: not
+    finite, beyond 1e9, A or O zero, A H V in one plane.
     """
 
     def at(letter: str) -> str:
@@ -234,10 +200,7 @@ def blind_part(model: CameraModel) -> float:
 def blind_notes(model: CameraModel, path: str | Path, place: str) -> tuple[str, ...]:
     """Return a note of the part of the image that has no ray, and why; none if every pixel has one.
 
-    Raises
-    ------
-    BadFile
-        If more than half of the image has no ray, or the lens folds at its axis.
+    Raises BadFile if more than half of the image has no ray, or the lens folds at its axis.
     """
     try:
         blind = blind_part(model)

@@ -13,6 +13,7 @@ from calib.files import CameraFile, read_bytes
 from calib.files.atomic import save_bytes
 from calib.files.cahvor_text import internal_parameters, looks_like_cahvor, parse_cahvor, save_cahvor
 from calib.files.file_storage import looks_like_storage, unzipped
+from calib.files.foreign import lens_pose
 from calib.files.mast_file import CAMERA_SCHEMA, StoredRig, parse_camera, parse_rig, save_camera
 from calib.files.mrcal_kalibr import (
     format_kalibr,
@@ -21,13 +22,10 @@ from calib.files.mrcal_kalibr import (
     looks_like_mrcal,
     parse_kalibr,
     parse_mrcal,
-    refuse_mirrored,
 )
 from calib.files.opencv_ros import (
-    Reading,
     format_camera_info,
     format_opencv,
-    lens_pose,
     looks_like_calibration,
     parse_calibration,
     read_document,
@@ -57,12 +55,7 @@ MAX_FILE_BYTES = 1 << 28
 LIMIT_PX = 0.25
 """A conversion that moves a pixel by more than this is refused unless the caller sets another limit."""
 
-_BY_SUFFIX = {
-    ".cahvor": "cahvor",
-    ".cameramodel": "mrcal",
-    ".yaml": "mastctl",
-    ".yml": "mastctl",
-}
+_BY_SUFFIX = {".cahvor": "cahvor", ".cameramodel": "mrcal", ".yaml": "mastctl", ".yml": "mastctl"}
 FORMATS = ("mastctl", "cahvor", "opencv", "ros", "kalibr", "mrcal")
 
 LENSES: dict[str, Kind] = {
@@ -80,6 +73,7 @@ _OFFERED: dict[str, tuple[str, ...]] = {
     "ros": ("plumb_bob", "rational_polynomial", "equidistant"),
     "kalibr": ("radtan", "equidistant"),
     "mrcal": ("cahvor", "plumb_bob", "rational_polynomial"),
+    "cahvor": ("cahvor",),
 }
 """Each format's lenses that a camera of another family is fitted as, the plainest first."""
 
@@ -88,39 +82,16 @@ _STORED: dict[str, tuple[str, ...]] = {
     "ros": ("plumb_bob", "rational_polynomial", "equidistant"),
     "kalibr": ("radtan", "equidistant"),
     "mrcal": ("radtan", "plumb_bob", "rational_polynomial", "thin_prism"),
+    "cahvor": (),
 }
 """Each format's lenses that hold a camera of the same family as it is, the shortest first."""
 
 
-@dataclass(frozen=True)
-class CameraFiles:
-    """Several cameras of one file, by name, and the refusal of each that cannot be read."""
-
-    cameras: Mapping[str, CameraFile]
-    refusals: Mapping[str, BadFile]
-    path: Path
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The cameras of the file, read or not."""
-        return (*self.cameras, *self.refusals)
-
-    def camera(self, name: str) -> CameraFile:
-        """Return one of the cameras. Raises BadFile if it cannot be read."""
-        if name in self.refusals:
-            raise self.refusals[name]
-        return self.cameras[name]
-
-
-def load_any(path: str | Path) -> StoredRig | CameraFile | CameraFiles:
-    """Read a mast file, or the camera (or cameras) of a file of any other known format.
+def load_any(path: str | Path) -> StoredRig | CameraFile | dict[str, CameraFile]:
+    """Read a mast file, or the camera, or the cameras by name, of a file of any other known format.
 
     The content shows the format. Where it does not, the suffix decides which format's refusal helps most.
-
-    Raises
-    ------
-    BadFile
-        If the file is none of these, or is one but malformed.
+    Raises BadFile if the file is none of these, or is one but malformed.
     """
     data = unzipped(read_bytes(path, MAX_FILE_BYTES), MAX_FILE_BYTES, path)
     suffix = Path(str(path).lower().removesuffix(".gz")).suffix
@@ -128,7 +99,7 @@ def load_any(path: str | Path) -> StoredRig | CameraFile | CameraFiles:
         return parse_mrcal(data, path)
     refusal = None
     try:
-        document, _ = read_document(data, path)
+        document = read_document(data, path)
     except BadFile as error:
         document, refusal = {}, error
     schema = document.get("schema")
@@ -136,10 +107,10 @@ def load_any(path: str | Path) -> StoredRig | CameraFile | CameraFiles:
         return parse_camera(data, path)
     if schema is not None or len({"mast", "cameras", "stereo"} & set(document)) > 1:
         return parse_rig(data, path)
-    if looks_like_kalibr(document):
-        return _one_or_all(parse_kalibr(data, path), path)
-    if looks_like_calibration(document):
-        return _one_or_all(parse_calibration(data, path), path)
+    for looks_so, parse in ((looks_like_kalibr, parse_kalibr), (looks_like_calibration, parse_calibration)):
+        if looks_so(document):
+            cameras = parse(data, path)
+            return next(iter(cameras.values())) if len(cameras) == 1 else cameras
     if suffix == ".cahvor" or looks_like_cahvor(data):
         return parse_cahvor(data, path)
     if refusal is not None and (looks_like_storage(data) or suffix in (".yaml", ".yml", ".xml", ".json")):
@@ -147,28 +118,13 @@ def load_any(path: str | Path) -> StoredRig | CameraFile | CameraFiles:
     raise BadFile(path, "", f"is not one of these formats: {KNOWN_FORMATS}")
 
 
-def _one_or_all(readings: Mapping[str, Reading], path: str | Path) -> CameraFile | CameraFiles:
-    cameras = {name: one for name, one in readings.items() if isinstance(one, CameraFile)}
-    refusals = {name: one for name, one in readings.items() if isinstance(one, BadFile)}
-    if not cameras:
-        raise next(iter(refusals.values()))
-    return next(iter(cameras.values())) if len(readings) == 1 else CameraFiles(cameras, refusals, Path(path))
-
-
 @dataclass(frozen=True)
 class Conversion:
     """What a conversion wrote.
 
-    Attributes
-    ----------
-    path, format
-        Where, and in which format.
-    lost
-        A sentence each: what the format could not hold.
-    lens
-        The lens of the format that was taken for each camera; empty where the format holds the model itself.
-    errors
-        How far each camera as written is from what it was made of; exact ones too.
+    ``lost`` says, a sentence each, what the format could not hold; ``lens`` is the lens of the format that
+    was taken for each camera, empty where the format holds the model itself; ``errors`` are how far each
+    camera as written is from what it was made of, exact ones too.
     """
 
     path: Path
@@ -186,10 +142,7 @@ class Conversion:
 def format_of(path: str | Path) -> str:
     """Return the format that a name requests: by its suffix, or by what precedes it (``left.ros.yaml``).
 
-    Raises
-    ------
-    BadFile
-        If the suffix is none of a known format.
+    Raises BadFile if the suffix is none of a known format.
     """
     suffixes = [suffix.lower() for suffix in Path(path).suffixes]
     if len(suffixes) > 1 and suffixes[-2][1:] in FORMATS:
@@ -209,26 +162,14 @@ def save_any(
 ) -> Conversion:
     """Save a camera in the format named, else in the one that the file's name asks for (``format_of``).
 
-    Parameters
-    ----------
-    camera
-        One camera, or several by name for a format that holds several: ``kalibr``.
-    path
-        The file.
-    format
-        One of ``FORMATS``; '' takes what the name asks for.
-    lens
-        The lens to take where the format has several (``radtan``, ``plumb_bob``, ``rational_polynomial``,
-        ``equidistant``, ``tilted``, ``cahvor``); '' takes the plainest within the limit
-        that is at most twice as far off as the nearest, else the nearest.
-    limit_px
-        The largest distance between a pixel of the camera and of what is written, anywhere in the image.
+    ``kalibr`` holds several cameras by name. ``lens`` is the lens to take where the format has several
+    (``radtan``, ``plumb_bob``, ``rational_polynomial``, ``equidistant``, ``tilted``, ``cahvor``); '' takes
+    the plainest within the limit that is at most twice as far off as the nearest, else the nearest.
+    ``limit_px`` is the largest distance between a pixel of the camera and of what is written, anywhere in the
+    image.
 
-    Raises
-    ------
-    BadFile
-        If the format or lens is unknown or cannot hold this, a pixel would move by more than ``limit_px``,
-        or the file cannot be saved; then nothing has changed.
+    Raises BadFile if the format or lens is unknown or cannot hold this, a pixel would move by more than
+    ``limit_px``, or the file cannot be saved; then nothing has changed.
     """
     cameras = {"camera": camera} if isinstance(camera, CameraFile) else dict(camera)
     to = format or format_of(path)
@@ -238,79 +179,48 @@ def save_any(
         raise BadFile(path, "", f"{len(cameras)} cameras where one is expected; kalibr holds several")
     if len({one.frame for one in cameras.values()}) > 1 and to == "kalibr":
         raise BadFile(path, "", "the cameras are in several frames; a camchain places them in one")
-    if to in ("mastctl", "cahvor"):
-        if lens:
-            raise BadFile(path, "", f"'{to}' holds the camera's own model; leave the lens out")
-        ((name, only),) = cameras.items()
-        if to == "mastctl":
-            save_camera(only, path)
-            return Conversion(Path(path), CAMERA_SCHEMA, ())
-        twin, errors = _as_cahvor(name, only, path, limit_px)
-        lost = save_cahvor(twin, path)
-        return Conversion(Path(path), "cahvor", lost, (twin.model.kind,) if errors else (), errors)
-    return _save_twins(cameras, path, to, lens, limit_px)
+    if lens and to in ("mastctl", "cahvor"):
+        raise BadFile(path, "", f"'{to}' holds the camera's own model; leave the lens out")
+    if lens and lens not in (*_OFFERED[to], *_STORED[to]):
+        known = ", ".join(dict.fromkeys((*_OFFERED[to], *_STORED[to])))
+        raise BadFile(path, "", f"lens '{lens[:20]}' where one of {known} is expected for {to}")
+    name, only = next(iter(cameras.items()))
+    if to == "mastctl":
+        save_camera(only, path)
+        return Conversion(Path(path), CAMERA_SCHEMA, ())
+    if to == "cahvor" and only.model.kind not in FREE:
+        return Conversion(Path(path), to, save_cahvor(only, path))
+    found = {name: _within_limit(name, one.model, path, to, lens, limit_px) for name, one in cameras.items()}
+    first, twin, _ = found[name]
+    if to == "cahvor":
+        lost = save_cahvor(replace(only, model=twin, fit={}), path)
+    else:
+        twins = {name: twin for name, (_, twin, _) in found.items()}
+        formatted = {
+            "kalibr": lambda: format_kalibr(twins, only.frame),
+            "ros": lambda: format_camera_info(twin, first, name),
+            "mrcal": lambda: format_mrcal(twin, only.frame),
+            "opencv": lambda: format_opencv(twin, only.frame),
+        }
+        save_bytes(path, formatted[to]())
+        lost = _lost(cameras, twins, to, only.frame)
+    lenses, _, errors = zip(*found.values(), strict=True)
+    return Conversion(Path(path), to, lost, lenses, errors)
 
 
-def _as_cahvor(
-    name: str, camera: CameraFile, path: str | Path, limit_px: float
-) -> tuple[CameraFile, tuple[TwinError, ...]]:
-    """The camera, or its nearest twin of the CAHV family and how near that is."""
-    if camera.model.kind not in FREE:
-        return camera, ()
+def _within_limit(
+    name: str, model: CameraModel, path: str | Path, to: str, lens: str, limit_px: float
+) -> tuple[str, CameraModel, TwinError]:
+    """As `nearest_lens`; refused if it is too far off."""
     try:
-        with np.errstate(all="ignore"):
-            model = nearest_cahvor(camera.model, limit_px)
-            error = twin_error(camera.model, model)
-    except (ValueError, np.linalg.LinAlgError) as problem:
+        taken, twin, error = nearest_lens(model, to, lens, limit_px)
+    except ValueError as problem:
         raise BadFile(path, "", f"the camera has no twin in this format: {problem}") from None
-    _within(error, limit_px, f"'{name}' as {model.kind}", "", path)
-    return replace(camera, model=model, fit={}), (error,)
-
-
-def _within(error: TwinError, limit_px: float, what: str, why: str, path: str | Path) -> None:
     if not error.worst_px <= limit_px:
         far = "does not see all of the image" if np.isinf(error.worst_px) else f"is {error_sentence(error)}"
-        raise BadFile(path, "", f"{what} {far}; the limit is {limit_px:g} px{why}")
-
-
-def _save_twins(
-    cameras: Mapping[str, CameraFile], path: str | Path, to: str, lens: str, limit_px: float
-) -> Conversion:
-    """Write the nearest cameras that a format of other lenses holds."""
-    offered = tuple(dict.fromkeys((*_OFFERED[to], *_STORED[to])))
-    if lens and lens not in offered:
-        raise BadFile(path, "", f"lens '{lens[:20]}' where one of {', '.join(offered)} is expected for {to}")
-    found: dict[str, tuple[str, CameraModel, TwinError]] = {}
-    for name, camera in cameras.items():
-        refuse_mirrored(camera.model, path)
-        try:
-            found[name] = nearest_lens(camera.model, to, lens, limit_px)
-        except ValueError as problem:
-            raise BadFile(path, "", f"the camera has no twin in this format: {problem}") from None
-        taken, _, error = found[name]
-        _within(error, limit_px, f"'{name}' as {taken}", _why(camera.model), path)
-    frame = next(iter(cameras.values())).frame
-    twins = {name: twin for name, (_, twin, _) in found.items()}
-    first = next(iter(twins.values()))
-    match to:
-        case "kalibr":
-            data = format_kalibr(twins, frame)
-        case "ros":
-            ((name, (taken, _, _)),) = found.items()
-            data = format_camera_info(first, taken, name)
-        case "mrcal":
-            data = format_mrcal(first, frame)
-        case _:
-            data = format_opencv(first, frame)
-    save_bytes(path, data)
-    lost = list(_lost(cameras, twins, to, frame))
-    return Conversion(
-        Path(path),
-        to,
-        tuple(lost),
-        tuple(t for t, _, _ in found.values()),
-        tuple(e for _, _, e in found.values()),
-    )
+        reason = f"'{name}' as {taken} {far}; the limit is {limit_px:g} px{_why(model)}"
+        raise BadFile(path, "", reason)
+    return taken, twin, error
 
 
 def nearest_lens(
@@ -319,13 +229,9 @@ def nearest_lens(
     """Return the lens of a format that serves a camera, the camera with that lens, and its error.
 
     The camera keeps its numbers where the format holds them; else its lens is the `plainest` that serves.
-
-    Raises
-    ------
-    ValueError
-        If its image is mirrored, or no lens of the format sees most of it.
+    Raises ValueError if its image is mirrored, or no lens of the format sees most of it.
     """
-    if np.cross(model.H, model.V) @ model.A < 0.0:
+    if to != "cahvor" and np.cross(model.H, model.V) @ model.A < 0.0:
         raise ValueError("its image is mirrored (H x V is against A)")
     for name in (lens,) if lens else _STORED[to]:
         if name in LENSES and model.kind != "CAHV" and (same := as_kind(model, LENSES[name])) is not None:
@@ -336,27 +242,23 @@ def nearest_lens(
     for name in (lens,) if lens else _OFFERED[to]:
         try:
             with np.errstate(all="ignore"):
-                twin = _twin(model, name, limit_px)
+                if name == "cahvor":
+                    twin = nearest_cahvor(model, limit_px)
+                    twin = twin if to == "cahvor" or _is_square(twin) else nearest_square(twin)
+                else:
+                    twin = nearest_opencv(model, LENSES[name])
                 error = twin_error(model, twin, model.moving)
         except (ValueError, np.linalg.LinAlgError) as reason:
             problem = str(reason)
             continue
-        names.append(name)
+        names.append(twin.kind if to == "cahvor" else name)
         tried.append((twin, error))
         if error.worst_px <= GOOD_PX:
-            return name, twin, error
+            return names[-1], twin, error
     if not tried:
         raise ValueError(problem)
     at = plainest(tried, limit_px)
     return names[at], *tried[at]
-
-
-def _twin(model: CameraModel, lens: str, limit_px: float) -> CameraModel:
-    """The nearest camera of a lens; the camera itself where that is one."""
-    if lens != "cahvor":
-        return nearest_opencv(model, LENSES[lens])
-    near = nearest_cahvor(model, limit_px)
-    return near if _is_square(near) else nearest_square(near)
 
 
 def _is_square(model: CameraModel) -> bool:

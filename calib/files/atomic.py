@@ -30,11 +30,7 @@ def keep_previous(path: str | Path) -> Path | None:
     """Give the kept version before the last save a name that no save takes, and return it.
 
     ``rig.previous.yaml`` is then ``rig.previous-1.yaml`` too (the first free number). None if there is none.
-
-    Raises
-    ------
-    BadFile
-        If the file system refuses.
+    Raises BadFile if the file system refuses.
     """
     try:
         previous = previous_path(Path(path).resolve())
@@ -54,12 +50,8 @@ def keep_previous(path: str | Path) -> Path | None:
 def save_bytes(path: str | Path, data: bytes) -> None:
     """Replace the file's content in one step; keep its permissions, and the old content as ``previous_path``.
 
-    A symbolic link stays one: the file that it names is replaced.
-
-    Raises
-    ------
-    BadFile
-        If the file system refuses; the file is then as it was before.
+    A symbolic link stays one: the file that it names is replaced. Raises BadFile if the file system refuses;
+    the file is then as it was before.
     """
     try:
         target = Path(path).resolve()
@@ -96,13 +88,9 @@ def save_bytes(path: str | Path, data: bytes) -> None:
 def replace_bytes(path: Path, data: bytes, mode: int = 0o600) -> None:
     """Replace the file's content in one step; when this returns it is on the disk.
 
-    Leftovers of crashed tries are removed. One process at a time may do this to a file.
-
-    Raises
-    ------
-    OSError
-        If the file system refuses: the old content is then there, or the new one if only its way to the disk
-        was not confirmed.
+    Leftovers of crashed tries are removed. One process at a time may do this to a file. Raises OSError if the
+    file system refuses: the old content is then there, or the new one if only its way to the disk was not
+    confirmed.
     """
     new = path.with_name(f".{path.name}.new")
     try:
@@ -121,12 +109,8 @@ def overwrite_bytes(path: Path, data: bytes) -> None:
 
     No name and no length changes, so the file system writes the bytes alone. On ext4 this takes a twentieth
     of the time of `replace_bytes`, and does not wait for other files. A crash meanwhile leaves the old, the
-    new, or parts of both.
-
-    Raises
-    ------
-    OSError
-        If the file system refuses, there is no file, or it is shorter than ``data``.
+    new, or parts of both. Raises OSError if the file system refuses, there is no file, or it is shorter than
+    ``data``.
     """
     descriptor = os.open(path, os.O_WRONLY | os.O_CLOEXEC)
     try:

@@ -48,10 +48,7 @@ def looks_like_cahvor(data: bytes) -> bool:
 def parse_cahvor(data: bytes, path: str | Path) -> CameraFile:
     """Read a .cahvor file's bytes; its frame is ``unknown``, a covariance that is not zero goes into ``fit``.
 
-    Raises
-    ------
-    BadFile
-        If it is no camera: which line, what it holds, what is expected.
+    Raises BadFile if it is no camera: which line, what it holds, what is expected.
     """
     values, matrices, unread = _lines(text_of(data, path), path)
     kind, cahvore_type, linearity = _kind(values, path)
@@ -68,7 +65,7 @@ def parse_cahvor(data: bytes, path: str | Path) -> CameraFile:
     if not all(number.is_integer() and 0 < number < 1e6 for number in size):
         raise BadFile(path, "Dimensions", f"'{values['Dimensions'][0]}' where width and height are expected")
     model, notes = build_model(path, "", kind, (int(size[0]), int(size[1])), vectors, cahvore_type, linearity)
-    notes += tuple(f"{key} is not read" for key in unread) + _check_internal(values, model, path)
+    notes += tuple(f"{key} is not read" for key in unread)
     fit: dict[str, Any] = {}
     if "S" in matrices:
         covariance = _matrix(matrices["S"], parameter_order(kind), path)
@@ -83,12 +80,8 @@ def parameter_order(kind: str) -> tuple[str, ...]:
 
 
 def save_cahvor(camera: CameraFile, path: str | Path) -> tuple[str, ...]:
-    """Save a camera as .cahvor text and return, a sentence each, what the format could not hold.
-
-    Raises
-    ------
-    BadFile
-        If the file system refuses; then nothing has changed.
+    """Save a camera as .cahvor text and return, a sentence each, what the format could not hold. Raises
+    BadFile.
     """
     text, lost = format_cahvor(camera)
     save_bytes(path, text.encode("utf-8"))
@@ -257,18 +250,6 @@ def _matrix(rows: Rows, order: Sequence[str], path: str | Path) -> FloatArray:
     if not np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-300) or (covariance.diagonal() < 0).any():
         raise BadFile(path, "S", "is not symmetric with a diagonal from zero up, as a covariance is")
     return covariance
-
-
-def _check_internal(values: Values, model: CameraModel, path: str | Path) -> tuple[str, ...]:
-    """Report where Hs, Hc, Vs, Vc of the file do not follow from its vectors; the vectors count."""
-    internal = internal_parameters(model)
-    notes = []
-    for key in _SCALARS[:4]:
-        if key in values:
-            stated = _numbers(values, key, 1, path)[0]
-            if abs(stated - internal[key]) > 0.1:
-                notes.append(f"{key} = {stated:g} in the file, {internal[key]:g} by its vectors, which count")
-    return tuple(notes)
 
 
 def _covariance_of(fit: Any, order: Sequence[str]) -> FloatArray | None:

@@ -8,6 +8,7 @@ deep nesting, and matrices in base64 with a broken head.
 from __future__ import annotations
 
 import gzip
+import io
 import re
 import zlib
 from pathlib import Path
@@ -36,15 +37,13 @@ def unzipped(data: bytes, limit_bytes: int, path: str | Path) -> bytes:
     """Return the bytes, a gzip file unpacked. Raises BadFile if it is cut or larger than the limit."""
     if not data.startswith(b"\x1f\x8b"):
         return data
-    unpack = zlib.decompressobj(16 + zlib.MAX_WBITS)
     try:
-        found = unpack.decompress(data, limit_bytes + 1)
-    except (zlib.error, gzip.BadGzipFile) as error:
+        with gzip.open(io.BytesIO(data)) as file:
+            found = file.read(limit_bytes + 1)
+    except (OSError, EOFError, zlib.error) as error:
         raise BadFile(path, "", f"is no whole gzip file: {error}") from None
     if len(found) > limit_bytes:
         raise BadFile(path, "", f"unpacks to more than {limit_bytes} bytes, the most that is read")
-    if not unpack.eof:
-        raise BadFile(path, "", "is a gzip file that is cut")
     return found
 
 
@@ -56,10 +55,7 @@ def looks_like_storage(data: bytes) -> bool:
 def parse_storage(data: bytes, path: str | Path) -> dict[str, Any]:
     """Return the keys of a FileStorage; of a list longer than ``LONGEST_LIST`` only its length.
 
-    Raises
-    ------
-    BadFile
-        If cv2 refuses it and it is no plain YAML either: the line, and cv2's reason.
+    Raises BadFile if cv2 refuses it and it is no plain YAML either: the line, and cv2's reason.
     """
     if len(data) > MAX_BYTES:
         raise BadFile(path, "", f"is larger than {MAX_BYTES} bytes, the most that is read")

@@ -281,10 +281,7 @@ class StoredRig:
 def load_rig(path: str | Path) -> StoredRig:
     """Read a mast file.
 
-    Raises
-    ------
-    BadFile
-        If it cannot be read or is no valid mast file: which key, what it holds, what is expected.
+    Raises BadFile if it cannot be read or is no valid mast file: which key, what it holds, what is expected.
     """
     return parse_rig(read_bytes(path, MAX_BYTES), path)
 
@@ -322,10 +319,8 @@ def parse_rig(data: bytes, path: str | Path) -> StoredRig:
 def save_rig(rig: Rig, path: str | Path) -> StoredRig:
     """Save a mast file atomically, keep the version before it, and return what a reader will find.
 
-    Raises
-    ------
-    BadFile
-        If the rig is none that the file can hold, or the file system refuses; then nothing has changed.
+    Raises BadFile if the rig is none that the file can hold, or the file system refuses; then nothing has
+    changed.
     """
     mast = rig.mast
     document: dict[str, Any] = {

@@ -18,9 +18,10 @@ mrcal does. Source: https://github.com/ethz-asl/kalibr/wiki/yaml-formats.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -30,40 +31,59 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import BadFile
 from calib.files import CameraFile, build_model, digest_of
-from calib.files.mast_file import SizePx
-from calib.files.opencv_ros import (
+from calib.files.foreign import (
     LENSES,
-    ForeignMapping,
-    Reading,
-    as_camera_file,
+    UNKNOWN_FRAME,
+    Numbers,
+    Source,
     coefficients,
     lens_camera,
+    lens_numbers,
     lens_pose,
     matrix44,
     matrix_of,
     pose_of,
-    read_document,
+    read_foreign,
 )
-from calib.files.records import Number, Text
+from calib.files.mast_file import SizePx
+from calib.files.opencv_ros import read_document
+from calib.files.records import ABSENT, Number, Record, Text
 from calib.files.twin import FISHEYE
 from calib.files.yaml_text import dump_mapping, kind_of, parse_mapping
 from calib.geometry.cahvor import FREE, CameraModel, Kind
-from calib.geometry.rigid import Rigid
+from calib.geometry.rigid import FloatArray, Rigid
 
-UNKNOWN_FRAME = "unknown"
 _INPUTS = re.compile(rb"""['"]optimization_inputs['"]\s*:\s*b(?:'[^']*'|"[^"]*")\s*,?""")
 _BEGINS = re.compile(rb"(?:\s|#[^\n]*\n)*\{")
 _CAHVORE = re.compile(r"LENSMODEL_CAHVORE_linearity=([-+0-9.eE]+)")
 _OPENCV = {"LENSMODEL_PINHOLE": 0} | {f"LENSMODEL_OPENCV{count}": count for count in (4, 5, 8, 12)}
-_MRCAL_LENS = ("lensmodel", "lens_model", "distortion_model")
-_MRCAL_POSE = ("rt_cam_ref", "extrinsics")
-_MRCAL_READ = (
-    *(*_MRCAL_LENS, *_MRCAL_POSE, "intrinsics", "imagersize"),
-    *("icam_intrinsics", "icam_intrinsics_optimization_inputs"),
-)
+_MRCAL_NAMES = {"lensmodel": ("lens_model", "distortion_model"), "rt_cam_ref": ("extrinsics",)}
+_MRCAL_IGNORED = ("icam_intrinsics", "icam_intrinsics_optimization_inputs")
 _MRCAL_MARK = re.compile(
     rb"['\"](?:lensmodel|lens_model|distortion_model)['\"]\s*:\s*b?['\"](?:LENSMODEL|DISTORTION)_"
 )
+_Four = Annotated[list[Number], Field(min_length=4, max_length=4)]
+_Pose = Annotated[list[_Four], Field(min_length=4, max_length=4)]
+
+
+class MrcalRecord(Record):
+    """The keys of mrcal's camera model."""
+
+    lensmodel: Text
+    rt_cam_ref: Annotated[list[Number], Field(min_length=6, max_length=6)]
+    intrinsics: list[Number]
+    imagersize: SizePx
+
+
+class KalibrRecord(Record):
+    """The keys of a camera of Kalibr's camchain."""
+
+    camera_model: Literal["pinhole"]
+    intrinsics: _Four
+    distortion_model: Literal["radtan", "equidistant", "none"]
+    resolution: SizePx
+    distortion_coeffs: Numbers = Field(default=[])
+    T_cn_cnm1: _Pose = Field(default=ABSENT)
 
 
 def looks_like_mrcal(data: bytes) -> bool:
@@ -74,35 +94,37 @@ def looks_like_mrcal(data: bytes) -> bool:
 def parse_mrcal(data: bytes, path: str | Path) -> CameraFile:
     """Read a .cameramodel; ``path`` is for messages only. Its frame is ``unknown``.
 
-    Raises
-    ------
-    BadFile
-        If it is no camera: which key, what it holds, what is expected.
+    Raises BadFile if it is no camera: which key, what it holds, what is expected.
     """
     bare = _INPUTS.sub(b"", data)
-    notes: tuple[str, ...] = ("optimization_inputs: not read",) if bare != data else ()
     # A mapping of numbers, texts and lists in Python's form is one in YAML's too.
-    top = ForeignMapping(path, "", parse_mapping(bare, path))
-    lens_key, pose_key = top.need(*_MRCAL_LENS), top.need(*_MRCAL_POSE)
-    for key in ("intrinsics", "imagersize"):
-        top.need(key)
-    name = str(top.read(Text, lens_key)).replace("DISTORTION", "LENSMODEL", 1)
-    width, height = top.read(SizePx, "imagersize")
-    pose = top.numbers(pose_key, 6)
+    keys = parse_mapping(bare, path)
+    record, source = read_foreign(MrcalRecord, keys, path, other_names=_MRCAL_NAMES, ignored=_MRCAL_IGNORED)
+    if bare != data:
+        source.notes.insert(0, "optimization_inputs: not read")
+    pose = np.array(record.rt_cam_ref)
     frame_from_camera = Rigid(Rotation.from_rotvec(pose[:3]).as_matrix(), pose[3:]).inverse
-    notes += top.unread(_MRCAL_READ)
+    name = record.lensmodel.replace("DISTORTION", "LENSMODEL", 1)
     if name in _OPENCV:
-        numbers = top.numbers("intrinsics", 4 + _OPENCV[name])
-        camera = lens_camera(
-            top, "pinhole", (width, height), matrix_of(numbers[:4]), numbers[4:], frame_from_camera
+        numbers = _counted(source, record, 4 + _OPENCV[name])
+        matrix, size = matrix_of(numbers[:4].tolist()), record.imagersize
+        return lens_camera(
+            source, "pinhole", size, matrix, numbers[4:], frame_from_camera, UNKNOWN_FRAME, digest_of(data)
         )
-        return as_camera_file(camera, top, UNKNOWN_FRAME, digest_of(data), notes)
-    model, model_notes = _cahvor(top, name, (width, height), frame_from_camera)
-    return CameraFile(model, UNKNOWN_FRAME, {}, {}, (*notes, *model_notes), Path(path), digest_of(data))
+    model, notes = _cahvor(source, record, name, frame_from_camera)
+    return CameraFile(model, UNKNOWN_FRAME, {}, {}, (*source.notes, *notes), Path(path), digest_of(data))
+
+
+def _counted(source: Source, record: MrcalRecord, count: int) -> FloatArray:
+    """The intrinsics, of which a lens has so many."""
+    if len(record.intrinsics) != count:
+        reason = f"{kind_of(record.intrinsics)} where a list of {count} numbers is expected"
+        raise source.bad("intrinsics", reason)
+    return np.array(record.intrinsics)
 
 
 def _cahvor(
-    top: ForeignMapping, name: str, size_px: tuple[int, int], frame_from_camera: Rigid
+    source: Source, record: MrcalRecord, name: str, frame_from_camera: Rigid
 ) -> tuple[CameraModel, tuple[str, ...]]:
     """The camera of LENSMODEL_CAHVOR or LENSMODEL_CAHVORE, with notes."""
     match = _CAHVORE.fullmatch(name)
@@ -110,13 +132,12 @@ def _cahvor(
         expected = (
             "PINHOLE, OPENCV4, 5, 8 or 12, CAHVOR or CAHVORE (mrcal-convert-lensmodel makes one of others)"
         )
-        raise top.bad("lensmodel", f"{kind_of(name)} where LENSMODEL_{expected} is expected")
-    numbers = top.numbers("intrinsics", 12 if match else 9)
+        raise source.bad("lensmodel", f"{kind_of(name)} where LENSMODEL_{expected} is expected")
+    numbers = _counted(source, record, 12 if match else 9)
     fx, fy, cx, cy, alpha, beta = numbers[:6].tolist()
     if fx * fy < 0.0:
-        raise top.bad(
-            "intrinsics", f"focal lengths {fx:g}, {fy:g} of two signs: a mirrored image is not read"
-        )
+        reason = f"focal lengths {fx:g}, {fy:g} of two signs: a mirrored image is not read"
+        raise source.bad("intrinsics", reason)
     x, y, z = frame_from_camera.rotation.T
     o = np.array([math.sin(alpha) * math.cos(beta), math.sin(beta), math.cos(alpha) * math.cos(beta)])
     vectors = {
@@ -131,14 +152,14 @@ def _cahvor(
     cahvore_type, linearity = 0, None
     if match:
         kind, vectors["E"] = "CAHVORE", numbers[9:]
-        try:
+        with contextlib.suppress(ValueError):
             linearity = float(match[1])
-        except ValueError:
-            raise top.bad("lensmodel", f"linearity '{match[1][:20]}' where a number is expected") from None
-        if not abs(linearity) <= 100.0:
-            raise top.bad("lensmodel", f"linearity {linearity:g} where a number from -100 to 100 is expected")
+        if linearity is None or not abs(linearity) <= 100.0:
+            reason = f"linearity {match[1][:20]} where a number from -100 to 100 is expected"
+            raise source.bad("lensmodel", reason)
         cahvore_type = {1.0: 1, 0.0: 2}.get(linearity, 3)
-    return build_model(top.path, "", kind, size_px, vectors, cahvore_type, linearity)
+    size_px = record.imagersize[0], record.imagersize[1]
+    return build_model(source.path, "", kind, size_px, vectors, cahvore_type, linearity)
 
 
 def format_mrcal(camera: CameraModel, frame: str) -> bytes:
@@ -180,25 +201,7 @@ def _numbers_of(model: CameraModel) -> tuple[str, list[float], Rigid]:
     return f"LENSMODEL_CAHVORE_linearity={linearity}", [*numbers, *model.E.tolist()], pose
 
 
-def refuse_mirrored(model: CameraModel, path: str | Path) -> None:
-    """Refuse a camera whose image is mirrored: mrcal's CAHVOR has no such one."""
-    if np.cross(model.H, model.V) @ model.A < 0.0:
-        raise BadFile(path, "", "the image is mirrored (H x V is against A); no such format can hold that")
-
-
 _CAMERA = re.compile(r"cam(0|[1-9][0-9]?)")
-_Lens = Literal["radtan", "equidistant", "none"]
-_Pose = Annotated[
-    list[Annotated[list[Number], Field(min_length=4, max_length=4)]], Field(min_length=4, max_length=4)
-]
-_KALIBR_READ = (
-    "camera_model",
-    "intrinsics",
-    "distortion_model",
-    "distortion_coeffs",
-    "resolution",
-    "T_cn_cnm1",
-)
 
 
 def looks_like_kalibr(document: Mapping[str, object]) -> bool:
@@ -207,75 +210,39 @@ def looks_like_kalibr(document: Mapping[str, object]) -> bool:
     return isinstance(first, dict) and "camera_model" in first
 
 
-def parse_kalibr(data: bytes, path: str | Path) -> dict[str, Reading]:
-    """Read all cameras of a camchain, by name, each or its refusal; ``path`` is for messages only.
+def parse_kalibr(data: bytes, path: str | Path) -> dict[str, CameraFile]:
+    """Read all cameras of a camchain, by name; ``path`` is for messages only.
 
-    Raises
-    ------
-    BadFile
-        If it is no camchain: which key, what it holds, what is expected.
+    Raises BadFile if it is no camchain: which key, what it holds, what is expected.
     """
-    document, notes_before = read_document(data, path)
-    top = ForeignMapping(path, "", document)
-    names = [name for name in top.values if _CAMERA.fullmatch(name)]
+    document = read_document(data, path)
+    names = [name for name in document if _CAMERA.fullmatch(name)]
     if names != [f"cam{at}" for at in range(len(names))] or not names:
-        raise BadFile(
-            path, "", f"{', '.join(names) or 'no camera'} where cam0, cam1, ... in order is expected"
-        )
-    first = top.values["cam0"]
+        expected = "where cam0, cam1, ... in order is expected"
+        raise BadFile(path, "", f"{', '.join(names) or 'no camera'} {expected}")
+    _, beside = read_foreign(Record, document, path, ignored=names)
+    first = document["cam0"]
     frame = UNKNOWN_FRAME if isinstance(first, dict) and "T_cn_cnm1" in first else "cam0"
-    notes_before = (*notes_before, *top.unread(names))
-    readings: dict[str, Reading] = {}
+    cameras: dict[str, CameraFile] = {}
     camera_from_frame = Rigid.identity()
-    lost: BadFile | None = None
     for name in names:
-        try:
-            section = ForeignMapping(path, name, top.values[name])
-            if lost is None:
-                try:
-                    camera_from_frame = _step(section) @ camera_from_frame
-                except BadFile as refusal:
-                    lost = refusal
-            if lost is not None:
-                raise lost
-            readings[name] = _kalibr_camera(
-                section, camera_from_frame.inverse, frame, digest_of(data), notes_before
-            )
-        except BadFile as refusal:
-            readings[name] = refusal
-    return readings
-
-
-def _step(section: ForeignMapping) -> Rigid:
-    """The transform from the camera before."""
-    if "T_cn_cnm1" in section:
-        return pose_of(section, "T_cn_cnm1", np.array(section.read(_Pose, "T_cn_cnm1")))
-    if section.place != "cam0":
-        raise section.bad("T_cn_cnm1", "the key is missing; it places the camera against the one before")
-    return Rigid.identity()
-
-
-def _kalibr_camera(
-    section: ForeignMapping, frame_from_camera: Rigid, frame: str, digest: str, notes_before: Sequence[str]
-) -> CameraFile:
-    for key in ("camera_model", "intrinsics", "distortion_model", "resolution"):
-        section.need(key)
-    if section.values["camera_model"] != "pinhole":
-        raise section.bad(
-            "camera_model", f"{kind_of(section.values['camera_model'])}; only 'pinhole' is read"
+        record, source = read_foreign(
+            KalibrRecord, document[name], path, name, ignored=("cam_overlaps", "rostopic")
         )
-    lens = section.read(_Lens, "distortion_model")
-    notes = list(notes_before)
-    numbers = section.numbers("distortion_coeffs") if "distortion_coeffs" in section else np.zeros(0)
-    if not len(numbers) and lens != "none":
-        section.need("distortion_coeffs")
-        raise section.bad("distortion_coeffs", f"an empty list where 4 numbers are expected for '{lens}'")
-    distortion = coefficients(section, "distortion_coeffs", lens, numbers, notes)
-    notes += section.unread((*_KALIBR_READ, "cam_overlaps", "rostopic"))
-    width, height = section.read(SizePx, "resolution")
-    matrix = matrix_of(section.numbers("intrinsics", 4))
-    camera = lens_camera(section, LENSES[lens][0], (width, height), matrix, distortion, frame_from_camera)
-    return as_camera_file(camera, section, frame, digest, notes)
+        source.notes[:0] = beside.notes
+        if record.T_cn_cnm1 is not None:
+            camera_from_frame = pose_of(source, "T_cn_cnm1", record.T_cn_cnm1) @ camera_from_frame
+        elif name != "cam0":
+            reason = "the key is missing; it places the camera against the one before"
+            raise source.bad("T_cn_cnm1", reason)
+        lens = record.distortion_model
+        if not record.distortion_coeffs and lens != "none":
+            raise source.bad("distortion_coeffs", f"no numbers where 4 are expected for '{lens}'")
+        distortion = coefficients(source, "distortion_coeffs", lens, record.distortion_coeffs)
+        size, matrix, pose = record.resolution, matrix_of(record.intrinsics), camera_from_frame.inverse
+        family = LENSES[lens][0]
+        cameras[name] = lens_camera(source, family, size, matrix, distortion, pose, frame, digest_of(data))
+    return cameras
 
 
 def format_kalibr(cameras: Mapping[str, CameraModel], frame: str) -> bytes:
@@ -288,7 +255,7 @@ def format_kalibr(cameras: Mapping[str, CameraModel], frame: str) -> bytes:
             "camera_model": "pinhole",
             "intrinsics": camera.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]],
             "distortion_model": "equidistant" if camera.kind == FISHEYE else "radtan",
-            "distortion_coeffs": camera.distortion if len(camera.distortion) else np.zeros(4),
+            "distortion_coeffs": lens_numbers(camera),
             "resolution": camera.size_px,
             "rostopic": f"/{name}/image_raw",
             "T_cn_cnm1": matrix44(pose.inverse @ before),

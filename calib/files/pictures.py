@@ -23,10 +23,7 @@ cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 def decode_picture(data: bytes, flags: int = AS_STORED) -> NDArray[Any]:
     """Return the pixels of a picture file, (h, w) or (h, w, 3), as cv2.imdecode does with the flags.
 
-    Raises
-    ------
-    ValueError
-        With the reason as the end of a sentence: it is cut short, damaged, or no picture.
+    Raises ValueError with the reason as the end of a sentence: it is cut short, damaged, or no picture.
     """
     if (spoiled := spoiled_png(data)) is not None:
         raise ValueError(spoiled)

@@ -173,10 +173,7 @@ def parse_record(kind: type[Kind], data: bytes, path: str | Path, schema: str) -
 def read_record(kind: type[Kind], document: object, path: str | Path, place: str = "") -> Kind:
     """Return the record that plain data hold; ``path`` and ``place`` are for messages.
 
-    Raises
-    ------
-    BadFile
-        With the place of the first mistake, its value and what would be right; see `_order`.
+    Raises BadFile with the place of the first mistake, its value and what would be right; see `_order`.
     """
     try:
         return kind.model_validate(document, context=Path(path).parent)

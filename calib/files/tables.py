@@ -19,6 +19,7 @@ import numpy as np
 
 from calib.errors import BadFile
 from calib.files import read_bytes, text_of
+from calib.files.yaml_text import nearest
 from calib.geometry.rigid import FloatArray
 
 MAX_BYTES = 1 << 29
@@ -30,20 +31,10 @@ _OTHER_DELIMITERS = {";": "';'", "\t": "tab", "|": "'|'"}
 
 
 def read_table(path: str | Path, columns: Sequence[str]) -> FloatArray:
-    """Return the table's numbers as (rows, columns).
+    """Return the table's numbers as (rows, columns); the header must name these columns in this order.
 
-    Parameters
-    ----------
-    path
-        The CSV file.
-    columns
-        The names that the header must have, in this order.
-
-    Raises
-    ------
-    BadFile
-        For another header, a row of another length, or a cell that is not a number. The place is the row,
-        counted from 1 after the header, and the line of the file.
+    Raises BadFile for another header, a row of another length, or a cell that is not a number. The place is
+    the row, counted from 1 after the header, and the line of the file.
     """
     return parse_table(read_bytes(path, MAX_BYTES), path, columns)
 
@@ -95,17 +86,31 @@ def write_table(stream: TextIO, columns: Sequence[str], values: FloatArray) -> N
     stream.writelines(",".join(map(repr, row)) + "\n" if good else empty for row, good in rows)
 
 
-def check_header(cells: Sequence[str], path: str | Path, columns: Sequence[str]) -> None:
-    """Refuse a header that does not name exactly these columns in this order. Raises BadFile."""
+def check_header(
+    cells: Sequence[str], path: str | Path, columns: Sequence[str], optional: Sequence[str] | None = None
+) -> list[str]:
+    """Return the names of a header: exactly these, or in any order these and perhaps some optional ones.
+
+    Raises BadFile.
+    """
     found = [cell.strip() for cell in cells]
     if found == list(columns):
-        return
+        return found
     expected = ",".join(columns)
     joined = ",".join(found)
     for delimiter, name in _OTHER_DELIMITERS.items():
         if [part.strip() for part in joined.split(delimiter)] == list(columns):
             raise BadFile(path, "line 1", f"the columns are separated by {name}; expected '{expected}'")
-    raise BadFile(path, "line 1", f"the header is '{joined[:60]}'; expected '{expected}'")
+    if optional is None or not set(found) & set(columns):
+        raise BadFile(path, "line 1", f"the header is '{joined[:60]}'; expected '{expected}'")
+    known = [*columns, *optional]
+    for name in (*found, *columns):
+        if name not in known:
+            raise BadFile(path, "line 1", f"'{name[:40]}' is no column; {nearest(name, known)}")
+        if found.count(name) != 1:
+            what = f"column {name} is there twice" if name in found else f"there is no column {name}"
+            raise BadFile(path, "line 1", f"{what}; expected '{expected}'")
+    return found
 
 
 def _row(cells: Sequence[str], path: str | Path, place: str, columns: Sequence[str]) -> list[float]:

@@ -8,15 +8,18 @@ twin.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from calib.geometry.cahvor import COEFFICIENTS, FREE, CameraModel, Kind
-from calib.geometry.parameters import parameter_names, parameter_part, predict, stepped
+from calib.geometry.parameters import parameter_part, predict
 from calib.geometry.rigid import FloatArray, tangents
 
 FIT_GRID = (25, 19)
@@ -37,8 +40,8 @@ GOOD_PX = 0.005
 _COEFFICIENT_PX = 1e-3
 """What a coefficient of 1 costs in a fit: nothing, except where the pixels do not tell it."""
 
-_STEPS = 60
-"""How many steps a fit may take."""
+_STEPS, _BIT, _NO_STEP_PX = 100, 1e-6, 1e-9
+"""How many cameras a fit may try; a step of numeric derivatives; a start this near is the answer."""
 
 _LOST_PX = 1e3
 """The residual of a point that the camera of a fit does not see."""
@@ -89,15 +92,9 @@ def _no_skew(model: CameraModel) -> FloatArray:
 class TwinError:
     """How far one camera is from another over their whole image.
 
-    Attributes
-    ----------
-    worst_px, rms_px
-        Of the distances between pixels, both ways: a ray of the one seen by the other. Infinite where the
-        other does not see it.
-    worst_at_px
-        The pixel where it is worst.
-    blind
-        Part of the image that has no ray in the first camera; nothing is compared there.
+    ``worst_px`` and ``rms_px`` are of the distances between pixels, both ways: a ray of the one seen by the
+    other; infinite where the other does not see it. ``worst_at_px`` is the pixel where it is worst. ``blind``
+    is the part of the image that has no ray in the first camera; nothing is compared there.
     """
 
     worst_px: float
@@ -124,14 +121,10 @@ def grid_px(size_px: tuple[int, int], counts: tuple[int, int], margin_px: float 
 
 
 def twin_error(camera: CameraModel, twin: CameraModel, near: bool = False) -> TwinError:
-    """Return how far ``twin`` is from ``camera`` (both in one frame), over the image to its outer border.
+    """Return how far ``twin`` is from ``camera`` (of one size, in one frame), over the image to its outer
+    border.
 
-    Parameters
-    ----------
-    camera, twin
-        Of one size, rays and points in the same frame.
-    near
-        Whether points 1 m away count too: they do where an entrance point moves.
+    With ``near`` points 1 m away count too: they do where an entrance point moves.
     """
     pixels = grid_px(camera.size_px, CHECK_GRID, 0.5)
     far, blind = [], 0.0
@@ -175,35 +168,40 @@ def nearest_opencv(model: CameraModel, kind: Kind) -> CameraModel:
     and a camera turned back leave an image that leans by the product of both turns. So OpenCV can hold H and
     V that are not at right angles.
 
-    Raises
-    ------
-    ValueError
-        If fewer than half of the image's pixels have a ray that such a lens can have; of 14 coefficients, if
-        the entrance point moves.
+    Raises ValueError if fewer than half of the image's pixels have a ray that such a lens can have; of 14
+    coefficients, if the entrance point moves.
     """
-    pixels, points = _what_it_sees(model)
+    seen = _points_of(model)
     if (same := as_kind(model, kind)) is not None:
         return same
-    if kind == "OPENCV14":
-        return _nearest_tilted(model, pixels, points)
-    found = []
-    for start in _starts(model, kind, pixels, points):
-        found.append(_fit(start, pixels, points, range(COEFFICIENTS[kind]), model.moving))
-        if twin_error(model, found[-1], model.moving).worst_px <= GOOD_PX:
+    if kind == "OPENCV14" and model.moving:
+        raise ValueError("the entrance point moves")
+    found: list[tuple[float, CameraModel]] = []
+    for start in _starts(model, kind, seen):
+        camera = _fit(start, *seen, move=model.moving)
+        found.append((twin_error(model, camera, model.moving).worst_px, camera))
+        if found[-1][0] <= GOOD_PX:
             break
-    return min(found, key=lambda one: twin_error(model, one, model.moving).worst_px)
+    return min(found, key=lambda one: one[0])[1]
 
 
-def _starts(model: CameraModel, kind: Kind, pixels: FloatArray, points: FloatArray) -> Iterator[CameraModel]:
+def _starts(model: CameraModel, kind: Kind, seen: tuple[FloatArray, FloatArray]) -> Iterator[CameraModel]:
     """Yield where fits of a kind begin: as plain as can be, and where a shorter list of coefficients ended.
 
     From the plain start a fraction's poles may come to lie in the image, and no step leads out again.
     """
-    plain = _plain_start(model, kind)
-    yield plain
-    if kind in ("OPENCV8", "OPENCV12"):
-        five = _fit(_plain_start(model, "OPENCV5"), pixels, points, range(5), model.moving)
-        numbers = np.concatenate([five.distortion, np.zeros(COEFFICIENTS[kind] - 5)])
+    if kind != "OPENCV14":
+        yield _plain_start(model, kind)
+    if kind not in ("OPENCV8", "OPENCV12", "OPENCV14"):
+        return
+    five = _fit(_plain_start(model, "OPENCV5"), *seen, move=model.moving)
+    h, v, a = model.H, model.V, model.A
+    # What a turned plane does to the lean grows as the square of its turn: from none no fit begins.
+    lean = abs(float(np.cross(h, a) @ np.cross(v, a))) / float(np.prod(model.focal_px))
+    turn = max(np.sqrt(lean), 1e-3)
+    for sign in (1.0, -1.0) if kind == "OPENCV14" else (0.0,):
+        numbers = np.pad(five.distortion, (0, COEFFICIENTS[kind] - 5))
+        numbers[12:] = [turn, sign * turn][: len(numbers) - 12]
         yield CameraModel.of_matrix(kind, model.size_px, five.camera_matrix, numbers, five.rotation, five.C)
 
 
@@ -223,24 +221,6 @@ def _plain_start(model: CameraModel, kind: Kind) -> CameraModel:
     return CameraModel.of_matrix(kind, model.size_px, matrix, distortion, axes.T, model.C)
 
 
-def _nearest_tilted(model: CameraModel, pixels: FloatArray, points: FloatArray) -> CameraModel:
-    if model.moving:
-        raise ValueError("the entrance point moves")
-    plain = _fit(_plain_start(model, "OPENCV5"), pixels, points, range(5), False)
-    across, down = (vector - (vector @ model.A) * model.A for vector in (model.H, model.V))
-    lean = float(across @ down / np.linalg.norm(across) / np.linalg.norm(down))
-    # From no turn at all no fit begins: what a turn does to the lean grows as its square.
-    turn = max(np.sqrt(abs(lean)), 1e-3)
-    found = []
-    for sign in (1.0, -1.0):
-        numbers = np.concatenate([plain.distortion, np.zeros(7), [turn, sign * turn]])
-        start = CameraModel.of_matrix(
-            "OPENCV14", model.size_px, plain.camera_matrix, numbers, plain.rotation, plain.C
-        )
-        found.append(_fit(start, pixels, points, (0, 1, 2, 3, 4, 12, 13), False))
-    return min(found, key=lambda camera: twin_error(model, camera).worst_px)
-
-
 def plainest(tried: Sequence[tuple[CameraModel, TwinError]], limit_px: float) -> int:
     """Return which of several twins to take, the plainest first: one within the limit that is at most twice
     as far off as the nearest, else the nearest."""
@@ -253,158 +233,113 @@ def nearest_cahvor(camera: CameraModel, limit_px: float = np.inf) -> CameraModel
     """Return a camera of the CAHV family whose pixels come near to one of OpenCV's, in the same frame.
 
     CAHVOR of a pinhole lens, or CAHVORE of type 3 without E; CAHVORE of type 2 of an equidistant one, or type
-    3; which of the two, `plainest` says. One of the CAHV family is its own.
-
-    Raises
-    ------
-    ValueError
-        If fewer than half of the image's pixels have a ray.
+    3; which of the two, `plainest` says. One of the CAHV family is its own. Raises ValueError if fewer than
+    half of the image's pixels have a ray.
     """
     if camera.kind not in FREE:
         return camera
-    pixels, points = _what_it_sees(camera)
+    seen = _points_of(camera)
     fisheye = camera.kind == FISHEYE
-    r = np.array([0.0, *camera.distortion[:2]])
-    tries: list[tuple[Kind, int]] = (
-        [("CAHVORE", 2), ("CAHVORE", 3)] if fisheye else [("CAHVOR", 0), ("CAHVORE", 3)]
-    )
+    plain: tuple[Kind, int] = ("CAHVORE", 2) if fisheye else ("CAHVOR", 0)
+    r, linearity = np.array([0.0, *camera.distortion[:2]]), 0.0 if fisheye else 1.0
     tried: list[tuple[CameraModel, TwinError]] = []
-    for kind, cahvore_type in tries:
-        start = CameraModel(
-            kind,
-            camera.size_px,
-            camera.C,
-            camera.A,
-            camera.H,
-            camera.V,
-            O=camera.A,
-            R=r,
-            cahvore_type=cahvore_type,
-            linearity=0.0 if fisheye else 1.0,
-        )
-        found = _fit(start, pixels, points, (), False)
+    for kind, cahvore_type in (plain, ("CAHVORE", 3)):
+        lens = replace(camera, kind=kind, cahvore_type=cahvore_type, distortion=np.zeros(0))
+        start = replace(lens, O=camera.A, R=r, linearity=linearity)
+        found = _fit(start, *seen, skew=True)
         tried.append((found, twin_error(camera, found)))
         if tried[-1][1].worst_px <= GOOD_PX:
-            return found
+            break
     return tried[plainest(tried, limit_px)][0]
 
 
 def nearest_square(model: CameraModel) -> CameraModel:
     """Return the camera of the same kind, H and V at right angles, whose pixels come nearest to a model's.
 
-    E, R0 and linearity stay what they are.
+    E and R0 stay what they are.
     """
-    pixels, points = _what_it_sees(model)
-    return _fit(_squared(model), pixels, points, (), False, square=True)
+    return _fit(model, *_points_of(model))
 
 
 def _fit(
-    start: CameraModel,
-    pixels: FloatArray,
-    points: FloatArray,
-    coefficients: Sequence[int],
-    placed: bool,
-    square: bool = False,
+    start: CameraModel, pixels: FloatArray, points: FloatArray, move: bool = False, skew: bool = False
 ) -> CameraModel:
-    """The camera of the kind of ``start`` that comes nearest; ``square`` or of OpenCV's kinds without skew.
+    """The camera of the kind of ``start`` whose pixels of the points come nearest; E stays what it is.
 
-    Levenberg and Marquardt's steps, each about the camera that the last one led to. ``coefficients`` are
-    those of OpenCV's that may change, ``placed`` whether C may; E stays, which is zero.
+    Unknown are a turn, the camera matrix (its skew if wanted), the lens and, if it may move, C. The lens is
+    OpenCV's coefficients (of 14 k1 to k3, p1, p2 and the plane's turns), or O about A, R1, R2, a linearity.
     """
-    square = square or start.kind in COEFFICIENTS
-    names = parameter_names(start.kind)
-    free = [at for at, name in enumerate(names) if name[0] not in ("E" if placed else "CE") + "D"]
-    if "D" in start.letters:
-        free += [parameter_part(start.kind, "D").start + at for at in coefficients]
-    general = start.cahvore_type == 3
-    camera, damping, whole = start, 1e-6, _sees_corners(start, pixels)
-    off, rates, basis = _off_and_rates(camera, pixels, points, free, general, square)
-    for _ in range(_STEPS):
-        if np.abs(off[: 2 * len(points)]).max() < EXACT_PX * 1e-3:
-            break
-        scale = np.maximum(np.linalg.norm(rates, axis=0), 1e-30)
-        normal = rates.T @ rates / np.outer(scale, scale)
-        step = -np.linalg.solve(normal + damping * np.eye(len(scale)), rates.T @ off / scale) / scale
-        try:
-            moved = stepped(camera, basis @ step[: basis.shape[1]])
-            moved = _squared(moved) if square else moved
-            if general:
-                moved = replace(moved, linearity=moved.linearity + float(step[-1]))
-            moved_off, moved_rates, moved_basis = _off_and_rates(moved, pixels, points, free, general, square)
-        except ValueError:  # the step led to no camera
-            moved_off = np.full(1, np.inf)
-        if not moved_off @ moved_off < off @ off or (whole and not _sees_corners(moved, pixels)):
-            damping *= 10.0
-            if damping > 1e6:
-                break
-            continue
-        settled = moved_off @ moved_off > (1.0 - 1e-6) * (off @ off)
-        camera, off, rates, basis, damping = (
-            moved,
-            moved_off,
-            moved_rates,
-            moved_basis,
-            max(0.1 * damping, 1e-12),
-        )
-        whole = whole or _sees_corners(camera, pixels)
-        if settled:
-            break
-    return camera
+    rows = start.rotation if skew or start.kind in FREE else even_axes(start).T
+    at = (0, 1, 0, 1, 0)[: 4 + skew], (0, 1, 2, 2, 1)[: 4 + skew]  # of the unknowns in the camera matrix
+    used = [0, 1, 2, 3, 4, 12, 13] if start.kind == "OPENCV14" else list(range(len(start.distortion)))
+    ends = np.cumsum([3, 4 + skew, 3 * move])
+    lens = start.distortion[used]
+    if "O" in start.letters:
+        o, general = rows @ start.O, [start.linearity] * (start.cahvore_type == 3)
+        lens = np.array([*o[:2] / o[2], *start.R[1:], *general])
+    first = np.stack([start.H, start.V]) @ rows.T
+    begin = np.concatenate([np.zeros(3), first[at], np.zeros(3 * move), lens])
 
+    def numbers_of(unknowns: FloatArray) -> dict[str, FloatArray]:
+        turn, inside, place, lens = np.split(unknowns, ends)
+        axes, matrix = Rotation.from_rotvec(turn).as_matrix() @ rows, np.zeros((2, 3))
+        matrix[at] = inside
+        h, v = matrix @ axes
+        found = {"C": start.C + (place if move else 0.0), "A": axes[2], "H": h, "V": v}
+        if "O" in start.letters:
+            o = axes.T @ [*lens[:2], 1.0]
+            found |= {"O": o / np.linalg.norm(o), "R": np.array([start.R[0], *lens[2:4]])}
+        elif used:
+            found["D"] = np.zeros(len(start.distortion))
+            found["D"][used] = lens
+        return found
 
-def _sees_corners(camera: CameraModel, pixels: FloatArray) -> bool:
-    """Whether the corners of a fit's pixels have rays: a lens may fold just there, and no point shows it."""
+    def camera_of(unknowns: FloatArray) -> CameraModel:
+        numbers: dict[str, Any] = numbers_of(unknowns)
+        if start.kind in FREE:  # without skew to the last bit
+            axes = Rotation.from_rotvec(unknowns[:3]).as_matrix() @ rows
+            matrix = np.eye(3)
+            matrix[at] = unknowns[3 : ends[1]]
+            return CameraModel.of_matrix(start.kind, start.size_px, matrix, numbers["D"], axes, numbers["C"])
+        if start.cahvore_type == 3:
+            numbers["linearity"] = float(unknowns[-1])
+        return replace(start, **numbers)
+
     corners = np.stack(np.meshgrid(*zip(pixels.min(axis=0), pixels.max(axis=0), strict=True)), axis=-1)
-    return bool(camera.ray(corners.reshape(-1, 2)).valid.all())
+    whole = bool(start.ray(corners).valid.all())
+
+    def off(unknowns: FloatArray) -> FloatArray:
+        far = np.full(pixels.shape, _LOST_PX)
+        with contextlib.suppress(ValueError):  # no camera
+            camera = camera_of(unknowns)
+            if not whole or camera.ray(corners).valid.all():  # a lens may fold there, and no point shows it
+                seen, valid = camera.project(points)
+                far = np.where(valid[:, None], seen - pixels, far)
+        return np.append(far, _COEFFICIENT_PX * unknowns[ends[-1] :] * (start.kind in FREE))
+
+    def rates(unknowns: FloatArray) -> FloatArray:
+        camera, numbers = camera_of(unknowns), numbers_of(unknowns)
+        seen = predict(camera, points)
+        steps = np.zeros((seen.d_step.shape[2], len(unknowns)))
+        for column, size in enumerate(np.maximum(np.abs(unknowns), 1.0) * _BIT):
+            moved = numbers_of(unknowns + size * (np.arange(len(unknowns)) == column))
+            for letter, vector in moved.items():
+                by = (vector - numbers[letter]) / size
+                by = tangents(numbers[letter]) @ by if letter in "AO" else by[1:] if letter == "R" else by
+                steps[parameter_part(start.kind, letter), column] = by
+        found = np.nan_to_num(seen.d_step @ steps).reshape(-1, len(unknowns))
+        if start.cahvore_type == 3:
+            other = replace(camera, linearity=camera.linearity + _BIT).project(points)[0]
+            found[:, -1] = np.nan_to_num((other - seen.pixels_px) / _BIT).ravel()
+        costs = _COEFFICIENT_PX * np.eye(len(unknowns))[ends[-1] :] * (start.kind in FREE)
+        return np.vstack([found, costs])
+
+    if np.abs(off(begin)[: pixels.size]).max() < _NO_STEP_PX:
+        return start
+    return camera_of(least_squares(off, begin, rates, method="lm", x_scale="jac", max_nfev=_STEPS).x)
 
 
-def _squared(model: CameraModel) -> CameraModel:
-    """A camera without its skew."""
-    if model.kind in COEFFICIENTS:
-        return CameraModel.of_matrix(
-            model.kind, model.size_px, _no_skew(model), model.distortion, model.rotation, model.C
-        )
-    x, y, z = even_axes(model).T
-    return replace(model, H=(model.H @ x) * x + (model.H @ z) * z, V=(model.V @ y) * y + (model.V @ z) * z)
-
-
-def _off_and_rates(
-    camera: CameraModel,
-    pixels: FloatArray,
-    points: FloatArray,
-    free: Sequence[int],
-    general: bool,
-    square: bool,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Pixels off (n,), their rates (n, f) to what is free, the linearity last, and what is free (p, f).
-
-    What pixels cannot tell of coefficients stays small: each costs a little.
-    """
-    seen = predict(camera, points)
-    basis = np.eye(seen.d_step.shape[2])[:, free]
-    if square:
-        a, h, v = (parameter_part(camera.kind, letter) for letter in "AHV")
-        x, y, z = even_axes(camera).T
-        kept = np.zeros((seen.d_step.shape[2], 7))  # turns about x, y, z; H along x and z, V along y and z
-        for column, axis in enumerate((x, y, z)):
-            kept[a, column] = tangents(z) @ np.cross(axis, z)
-            kept[h, column], kept[v, column] = np.cross(axis, camera.H), np.cross(axis, camera.V)
-        kept[h, 3], kept[h, 4], kept[v, 5], kept[v, 6] = x, z, y, z
-        others = [at for at in free if not a.start <= at < v.stop]
-        basis = np.hstack([np.eye(len(kept))[:, others], kept])
-    off = np.where(seen.valid[:, None], seen.pixels_px - pixels, _LOST_PX).ravel()
-    rates = np.nan_to_num(seen.d_step @ basis).reshape(len(off), -1)
-    if general:
-        bit = 1e-6
-        other = replace(camera, linearity=camera.linearity + bit).project(points)[0]
-        rates = np.column_stack([rates, np.nan_to_num((other - seen.pixels_px) / bit).ravel()])
-    if "D" in camera.letters:
-        off = np.concatenate([off, _COEFFICIENT_PX * camera.distortion])
-        rates = np.concatenate([rates, _COEFFICIENT_PX * basis[parameter_part(camera.kind, "D")]])
-    return off, rates, basis
-
-
-def _what_it_sees(camera: CameraModel) -> tuple[FloatArray, FloatArray]:
+def _points_of(camera: CameraModel) -> tuple[FloatArray, FloatArray]:
     """Pixels (n, 2) over the image and points (n, 3) seen there, near ones too where that matters."""
     pixels = grid_px(camera.size_px, FIT_GRID, 0.5)
     rays = camera.ray(pixels)

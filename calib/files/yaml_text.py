@@ -38,19 +38,9 @@ _PARSER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def parse_mapping(data: bytes, path: str | Path) -> dict[str, Any]:
-    """Return the one mapping that the bytes hold: str keys; dict, list, str, int, float, bool, None inside.
+    """Return the one mapping that UTF-8 bytes hold: str keys; dict, list, str, int, float, bool, None inside.
 
-    Parameters
-    ----------
-    data
-        The file's bytes, UTF-8 (a byte-order mark is allowed).
-    path
-        For messages only.
-
-    Raises
-    ------
-    BadFile
-        For everything else; the place is the line or the key.
+    Raises BadFile for everything else; the place is the line or the key.
     """
     if len(data) > MAX_BYTES:
         raise BadFile(path, "", f"is larger than {MAX_BYTES} bytes, the most that is read")
@@ -176,14 +166,10 @@ _Dumper.add_implicit_resolver(
 
 
 def dump_mapping(data: Mapping[str, Any]) -> bytes:
-    """Return plain data as YAML: keys in their order, vectors on one line, floats in shortest form.
+    """Return plain data (else TypeError) as YAML: keys in their order, vectors on one line, floats in
+    shortest form.
 
     Words that YAML 1.1 reads as something else (``on``) are quoted, so every YAML reader agrees.
-
-    Raises
-    ------
-    TypeError
-        If the data holds something that is not plain (see ``plain``).
     """
     text = yaml.dump(
         plain(data),
@@ -197,13 +183,7 @@ def dump_mapping(data: Mapping[str, Any]) -> bytes:
 
 
 def plain(value: Any) -> Any:
-    """Return the value as dict, list, str, int, float, bool and None; arrays become lists.
-
-    Raises
-    ------
-    TypeError
-        For a kind of value that a file cannot hold.
-    """
+    """Return the value as dict, list, str, int, float, bool, None; arrays become lists. Raises TypeError."""
     if isinstance(value, Mapping):
         if not all(isinstance(key, str) for key in value):
             raise TypeError("a key that is not text")

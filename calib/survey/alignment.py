@@ -33,20 +33,11 @@ class NotAligned(CalibError):
 class Alignment:
     """The pose that carries points of frame a onto points of frame b.
 
-    Attributes
-    ----------
-    b_from_a
-        The pose.
-    covariance
-        (6, 6) of its turn (rotation vector in b, radians) and shift (metres), from the stated sigmas.
-    names, residuals_m
-        The points, and (n, 3) what was measured in b less what the pose says, also of the rejected.
-    rejected
-        Names of points that were left out: with them the rest is off, without them it fits.
-    doubt
-        '' where all that was used agrees; else a sentence that says which points disagree, and how much.
-    chi2, degrees_of_freedom
-        Of the points that were used.
+    ``covariance`` (6, 6) is of its turn (rotation vector in b, radians) and shift (metres), from the stated
+    sigmas. ``residuals_m`` (n, 3) are what was measured in b less what the pose says, also of the
+    ``rejected`` points, which were left out: with them the rest is off, without them it fits. ``doubt`` is ''
+    where all that was used agrees, else a sentence that says which points disagree, and how much. ``chi2``
+    and ``degrees_of_freedom`` are of the points that were used.
     """
 
     b_from_a: Rigid
@@ -67,29 +58,16 @@ def align(
     *,
     false_alarm: float = Level.WHOLE,
 ) -> Alignment:
-    """Fit the pose between two sets of points, and leave out those that were mis-measured.
+    """Fit the pose between the same points (n, 3) in two frames, metres, without those mis-measured.
 
     With four points or more, if chi-square is beyond chance, one point is left out: the only one without
     which the others fit. If there is no such point, and with three points, the distances between points say
-    which disagree, and nothing is left out.
+    which disagree, and nothing is left out. ``sigma_m`` is the standard deviation of the difference of a
+    point, one axis, one number or (n,); ``false_alarm`` how often points without a blunder may be called in
+    doubt.
 
-    Parameters
-    ----------
-    points_in_a_m, points_in_b_m
-        (n, 3) the same points in both frames, metres.
-    sigma_m
-        Standard deviation of the difference of a point, one axis; one number or (n,).
-    names
-        (n,) for the refusals.
-    false_alarm
-        How often points without a blunder may be called in doubt.
-
-    Raises
-    ------
-    NotAligned
-        If there are fewer than three points, they stand on one line, or a number is not finite.
-    ValueError
-        If the lists are not equally long, or a sigma is not above 0.
+    Raises NotAligned if there are fewer than three points, they stand on one line, or a number is not finite;
+    ValueError if the lists are not equally long, or a sigma is not above 0.
     """
     a, b = (np.asarray(points, dtype=np.float64).reshape(-1, 3) for points in (points_in_a_m, points_in_b_m))
     if not len(a) == len(b) == len(names):
@@ -165,13 +143,7 @@ def poses(
 
 
 def rover_from_station(survey: Survey, *, false_alarm: float = Level.WHOLE) -> dict[str, Alignment]:
-    """Return the pose of every set-up from its prisms, by the set-up's name.
-
-    Raises
-    ------
-    NotAligned
-        Naming the set-up with fewer than three prisms.
-    """
+    """Return the pose of every set-up from its prisms. Raises NotAligned for one with fewer than three."""
     found: dict[str, Alignment] = {}
     for (setup, _), pose in poses(survey, "prism", false_alarm).items():
         if isinstance(pose, NotAligned):
@@ -185,10 +157,7 @@ def station_from_board(
 ) -> dict[tuple[str, str], Alignment]:
     """Return the pose of every placement with three tapes, by set-up and placement.
 
-    Raises
-    ------
-    NotAligned
-        Naming the placement whose tapes are on one line.
+    Raises NotAligned for tapes on one line.
     """
     enough = {key for key, seen in survey.measured("tape").items() if len(seen) > 2}
     found: dict[tuple[str, str], Alignment] = {}

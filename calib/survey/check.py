@@ -46,14 +46,8 @@ def check_survey(
 ) -> tuple[SurveyFinding, ...]:
     """Return what is missing, too little, or at odds with itself in a survey; errors first.
 
-    Parameters
-    ----------
-    survey
-        As `calib.survey.reader.read_survey` gives it; pictures are looked for in its folder.
-    pan_limits_rad, tilt_limits_rad
-        Beyond these, joint angles are refused.
-    only_camera_images
-        Whether cameras will be fitted to images of purpose camera alone, as the paper does.
+    Pictures are looked for in the survey's folder. Joint angles beyond the limits are refused. With
+    ``only_camera_images`` cameras will be fitted to images of purpose camera alone, as the paper does.
     """
     purposes = ("camera",) if only_camera_images else ("camera", "mast")
     angles = list(_angles(survey, pan_limits_rad, tilt_limits_rad))

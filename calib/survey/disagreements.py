@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from itertools import combinations, pairwise
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -27,10 +27,6 @@ FEWEST_IMAGES = 5
 
 STATED_OFF = 5.0
 """A station's sigma may be stated so many times too small: a fit finds that, and its verdict says it."""
-
-SAME_PLACE_M = 1e-6
-NEAR_DOT = 0.25
-"""Two dots nearer than this part of the usual distance are one dot found twice."""
 
 
 def wrong_units(survey: Survey) -> Iterator[SurveyFinding]:
@@ -62,7 +58,7 @@ def wrong_units(survey: Survey) -> Iterator[SurveyFinding]:
 
 
 def wrong_points(survey: Survey) -> Iterator[SurveyFinding]:
-    """Yield columns that mirror the world, points that disagree with the design, rows that are copies."""
+    """Yield columns that mirror the world, and points that disagree with the design."""
     sigma_m = float(np.hypot(survey.sigma.station_m, survey.sigma.prism_cad_m))
     prisms, design = survey.measured("prism"), survey.prisms_in_rover_m
     inverted = [
@@ -84,20 +80,15 @@ def wrong_points(survey: Survey) -> Iterator[SurveyFinding]:
     for (setup, placement), seen in survey.measured("tape").items():
         place = f"set-up {setup}, placement {placement}"
         yield from _disagreement(place, "tape", design, seen, sigma_m, (setup, placement) in fitted)
-    yield from _copies(survey)
 
 
 def wrong_dots(survey: Survey) -> Iterator[SurveyFinding]:
-    """Yield grids seen in a mirror, dots found twice, and images that share their dots."""
+    """Yield grids seen in a mirror, and images that share their dots."""
     flipped, first_with = [], dict[bytes, str]()
-    fitted = {image.name for image in survey.images if image.purpose != "check"}
     for name, dots in survey.dots.items():
         spread = _dots_per_board(survey, dots)
         if spread is not None and np.linalg.det(spread) < 0:
             flipped.append(name)
-        near = _found_twice(dots)
-        if near is not None:
-            yield SurveyFinding("warning", f"dots.csv, image {name}", *near, tested_again=name in fitted)
         key = dots.pixels_px.tobytes()
         if key in first_with:
             yield SurveyFinding(
@@ -212,44 +203,6 @@ def _disagreement(
 
 def _on_design(design: Mapping[str, FloatArray], seen: Mapping[str, FloatArray], sigma_m: float) -> Alignment:
     return align([design[name] for name in seen], list(seen.values()), sigma_m, list(seen))
-
-
-def _copies(survey: Survey) -> Iterator[SurveyFinding]:
-    """Yield points of one set-up with the same coordinates to the micrometre."""
-    for setup in dict.fromkeys(point.setup for point in survey.station):
-        mine = [point for point in survey.station if point.setup == setup]
-        places = np.array([point.position_m for point in mine])
-        order = np.lexsort(places.T)
-        for i, j in pairwise(order):
-            if np.abs(places[i] - places[j]).max() < SAME_PLACE_M:
-                first, second = sorted((mine[i], mine[j]), key=lambda point: point.row)
-                yield SurveyFinding(
-                    "error",
-                    f"station.csv line {second.row}",
-                    f"{second.kind} {second.point} {second.placement} has the coordinates of {first.kind} "
-                    f"{first.point} {first.placement} on line {first.row}",
-                    "Two measurements never agree to the micrometre: one is a copy, measure it",
-                )
-
-
-def _found_twice(dots: Dots) -> tuple[str, str] | None:
-    """Say which two dots of an image are at the same place."""
-    if len(dots.rows) < 4:
-        return None
-    gaps = np.linalg.norm(dots.pixels_px[:, None] - dots.pixels_px[None], axis=-1)
-    np.fill_diagonal(gaps, np.inf)
-    nearest_px = gaps.min(axis=1)
-    usual_px = float(np.median(nearest_px))
-    if nearest_px.min() >= NEAR_DOT * usual_px:
-        return None
-    i = int(nearest_px.argmin())
-    j = int(gaps[i].argmin())
-    (a, b), (c, d) = ((int(dots.rows[k]), int(dots.columns[k])) for k in (i, j))
-    return (
-        f"dots (row {a}, column {b}) and (row {c}, column {d}) are {gaps[i, j]:.2f} px apart "
-        f"where {usual_px:.0f} px are usual",
-        "Take out the one that is not there",
-    )
 
 
 def _dots_per_board(survey: Survey, dots: Dots) -> FloatArray | None:

@@ -45,15 +45,8 @@ def detect_survey(
 ) -> SurveyDots:
     """Return the dots of every image of a survey, found in its picture where dots.csv has none.
 
-    Parameters
-    ----------
-    survey
-        With its folder, under which the pictures are.
-    executor
-        Where the work is done, e.g. a ``ProcessPoolExecutor`` (its workers must reach the pictures); here
-        and now if None. The result does not depend on it.
-    progress
-        Called after each image, in this thread.
+    The work is done in the executor, e.g. a ``ProcessPoolExecutor`` (its workers must reach the pictures), or
+    in this thread; the result does not depend on it. ``progress`` is called after each image, in this thread.
     """
     wanted = [image for image in survey.images if image.name not in survey.dots and _has_picture(image)]
     expected = expectations(survey)

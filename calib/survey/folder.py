@@ -151,11 +151,7 @@ class SurveyFolder:
         if not required and not path.exists():
             return
         rows = csv_rows(text_of(self._bytes_of(name, CSV_MAX_BYTES), path), path)
-        header = [cell.strip() for cell in next(rows, (1, []))[1]]
-        if may_be_there is None:
-            check_header(header, path, columns)
-        else:
-            _check_names(header, path, columns, may_be_there)
+        header = check_header(next(rows, (1, []))[1], path, columns, may_be_there)
         for count, (line, cells) in enumerate(rows):
             if count == MAX_ROWS:
                 raise BadFile(path, "", f"has more than {MAX_ROWS} rows, the most that is read")
@@ -183,20 +179,3 @@ class SurveyFolder:
         """Return the SHA-256 over names and contents of all that was read."""
         listing = "".join(f"{digest}  {name}\n" for name, digest in sorted(self._digests.items()))
         return digest_of(listing.encode("utf-8", "surrogatepass"))
-
-
-def _check_names(
-    found: Sequence[str], path: Path, columns: Sequence[str], may_be_there: Sequence[str]
-) -> None:
-    """Refuse a header unless its columns are known, each there once, and none missing that must be there."""
-    if not set(found) & set(columns):  # separated by something else, or no header
-        check_header(found, path, columns)
-    known = [*columns, *may_be_there]
-    for name in found:
-        if name not in known:
-            raise BadFile(path, "line 1", f"'{name[:40]}' is no column; {nearest(name, known)}")
-        if found.count(name) > 1:
-            raise BadFile(path, "line 1", f"column {name} is there twice")
-    for name in columns:
-        if name not in found:
-            raise BadFile(path, "line 1", f"there is no column {name}; expected '{','.join(columns)}'")

@@ -176,19 +176,13 @@ def read_survey(folder: str | Path) -> Survey:
     """Read a survey folder.
 
     Pictures are read for their size alone; whether there are enough of them, and whether the measurements fit
-    together, is for `calib.survey.check.check_survey`.
+    together, is for `calib.survey.check.check_survey`. The survey's ``digest`` is the SHA-256 over names and
+    contents of the files that were read and of the pictures that images.csv names: the same on every machine,
+    another with every byte that changes.
 
-    Returns
-    -------
-    Survey
-        Its ``digest`` is the SHA-256 over names and contents of the files that were read and of the pictures
-        that images.csv names. It is the same on every machine and changes with every byte.
-
-    Raises
-    ------
-    BadFile
-        For a file that is missing or cannot be read, an unknown key, column or name, an invalid number, a
-        double row, an image of another size. The message has the file, the place, and what would be right.
+    Raises BadFile for a file that is missing or cannot be read, an unknown key, column or name, an invalid
+    number, a double row, an image of another size. The message has the file, the place, and what would be
+    right.
     """
     read = SurveyFolder(Path(folder))
     file, data = read.path / "survey.yaml", read.document()

@@ -139,18 +139,10 @@ class Survey:
 class SurveyFinding:
     """Something about a survey that a person should know before it is fitted.
 
-    Attributes
-    ----------
-    severity
-        ``error``: do not fit this; ``warning``: the fit can go on and may be worse for it.
-    place
-        Where: a file with its line, a camera, a set-up, a placement.
-    message
-        The finding, with its numbers.
-    advice
-        The measurement to take or correct.
-    tested_again
-        Whether it is about single measurements that the joint fit tests itself, by all the others.
+    ``error``: do not fit this; ``warning``: the fit can go on and may be worse for it. The place is a file
+    with its line, a camera, a set-up or a placement. The message has the finding's numbers, the advice the
+    measurement to take or correct. ``tested_again`` findings are about single measurements that the joint fit
+    tests itself, by all the others.
     """
 
     severity: Literal["error", "warning"]

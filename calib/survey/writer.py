@@ -60,20 +60,10 @@ class BenchFolder:
     """A bench's folder that grows by one image at a time.
 
     After a kill or a power cut at any moment `calib.survey.reader.read_survey` reads the folder. An image in
-    images.csv has its file, and all of its corners or none of them.
+    images.csv has its file, and all of its corners or none of them. The folder holds no survey yet (it is
+    made where it is missing), or that of a bench with the same boards, sigmas and cameras, which goes on.
 
-    Parameters
-    ----------
-    path
-        A folder that holds no survey yet (it is made where it is missing), or that of a bench with the same
-        boards, sigmas and cameras, which goes on.
-    boards, sigma, cameras, stereo
-        As of `calib.survey.records.Survey`.
-
-    Raises
-    ------
-    BadFile
-        If the folder holds another survey, or something that is none, or the file system refuses.
+    Raises BadFile if the folder holds another survey, or something that is none, or the file system refuses.
     """
 
     def __init__(
@@ -111,24 +101,11 @@ class BenchFolder:
         return read_survey(self.path)
 
     def append(self, image: SurveyImage, corners: Corners | None, picture: bytes | None = None) -> None:
-        """Add an image; when this returns it is on the disk.
+        """Add an image of a new name; when this returns it is on the disk.
 
-        The picture goes first, then the image's row, then its corners.
-
-        Parameters
-        ----------
-        image
-            Of a name that is not there yet; its ``row`` does not count.
-        corners
-            The corners found in it; None or empty where there were none.
-        picture
-            The bytes of ``image.file``, PNG or JPEG; None where it is there already, or there is none.
-
-        Raises
-        ------
-        BadFile
-            If the name is there already, the picture lies outside the folder, or the file system refuses; the
-            folder is then readable still.
+        The picture goes first (PNG or JPEG; None where it is there already, or there is none), then the
+        image's row, then its corners. Raises BadFile if the name is there already, the picture lies outside
+        the folder, or the file system refuses; the folder is then readable still.
         """
         if any(other.name == image.name for other in self._images):
             raise BadFile(self.path / "images.csv", "", f"has an image {image.name} already")
@@ -166,23 +143,14 @@ def _leaves(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def write_survey(survey: Survey, folder: str | Path, pictures: Iterable[tuple[str, bytes]] = ()) -> Survey:
-    """Write a survey as a new folder and return what a reader finds there.
+    """Write a survey as a new folder, or into an empty one, and return what a reader finds there.
 
     Everything is written beside the folder, read back, and then renamed into place. Tables without rows are
-    left out. A sigma of single dots is not written: the format has no place.
+    left out. A sigma of single dots is not written: the format has no place. ``pictures`` are file names, as
+    the survey's images name them, with the bytes of the PNG or JPEG.
 
-    Parameters
-    ----------
-    folder
-        Must not exist, or be empty.
-    pictures
-        File names, as the survey's images name them, with the bytes of the PNG or JPEG.
-
-    Raises
-    ------
-    BadFile
-        If the folder holds something, the survey is none that a reader takes, or the file system refuses;
-        then nothing is left behind.
+    Raises BadFile if the folder holds something, the survey is none that a reader takes, or the file system
+    refuses; then nothing is left behind.
     """
     try:
         target = Path(folder).resolve()

@@ -225,10 +225,7 @@ def _scale(key: str, value: float, wanted: float, part: float) -> float:
 def load_board(path: str | Path) -> AnyBoard:
     """Read a BOARD.yaml; the board has the sizes of the print.
 
-    Raises
-    ------
-    BadFile
-        If it cannot be read or is no board: which key, what it holds, what is expected.
+    Raises BadFile if it cannot be read or is no board: which key, what it holds, what is expected.
     """
     return parse_board(read_bytes(path, MAX_BYTES), path)
 
@@ -247,17 +244,8 @@ def save_board(
 ) -> None:
     """Write a BOARD.yaml atomically, after it was read as it will be.
 
-    Parameters
-    ----------
-    board
-        As drawn.
-    bar_m, measured_m
-        The bars' lengths as drawn, and as measured on the print, across and down.
-
-    Raises
-    ------
-    BadFile
-        If a bar cannot have been measured so, or the file system refuses.
+    ``board`` is as drawn, ``bar_m`` and ``measured_m`` are the bars' lengths, across and down, as drawn and
+    on the print. Raises BadFile if a bar cannot have been measured so, or the file system refuses.
     """
     document: dict[str, Any] = {"schema": SCHEMA}
     if name:

@@ -35,12 +35,8 @@ FLAT: Bow = (0.0, 0.0)
 class _Grid(ABC):
     """Corners at crossings of lines; what a kind adds are the lines.
 
-    Attributes
-    ----------
-    columns, rows
-        What is printed across and down: squares, tags or dots.
-    aspect
-        Length down over length across of what is drawn equally long: a printer's two directions differ.
+    ``columns`` and ``rows`` count squares, tags or dots. ``aspect`` is the length down over the length across
+    of what is drawn equally long: a printer's two directions differ.
     """
 
     columns: int
@@ -59,13 +55,7 @@ class _Grid(ABC):
         return np.arange(len(across) * len(down))
 
     def cells(self, ids: ArrayLike) -> tuple[IntArray, IntArray]:
-        """Return the rows and columns (n,) of corners, counted from the upper left one.
-
-        Raises
-        ------
-        ValueError
-            If the board has no such corner.
-        """
+        """Return the rows and columns (n,) of corners, counted from the upper left one. Raises ValueError."""
         across, down = self.lines_m
         wanted = np.asarray(ids, dtype=np.int64)
         if wanted.size and not (wanted.min() >= 0 and wanted.max() < len(across) * len(down)):
@@ -76,15 +66,9 @@ class _Grid(ABC):
         return rows, columns
 
     def in_board_m(self, ids: ArrayLike, bow_m: Bow = FLAT) -> FloatArray:
-        """Return where corners are, (n, 3) metres in the board frame; linear in ``bow_m``.
+        """Return where corners (n,) are, (n, 3) metres in the board frame; linear in ``bow_m``.
 
-        Parameters
-        ----------
-        ids
-            (n,) of ``self.ids``.
-        bow_m
-            (across, down), metres; the middle of a bent board is at z = -(across + down), its four outermost
-            corners at z = 0.
+        The middle of a bent board is at z = -(across + down), its four outermost corners at z = 0.
         """
         rows, columns = self.cells(ids)
         across, down = self.lines_m
@@ -128,16 +112,8 @@ class Checkerboard(_Squares):
 class Charuco(_Squares):
     """A ChArUco board of OpenCV: squares, the upper left one black, and a marker in each white square.
 
-    Attributes
-    ----------
-    marker_m
-        Side of a marker, black border included.
-    dictionary
-        OpenCV's name, as ``DICT_5X5_100``.
-    first_id
-        The marker in the first white square; the others count on from it, row by row.
-    legacy
-        OpenCV before 4.6 drew boards of an even number of rows with a white square in the upper left corner.
+    ``marker_m`` is with the black border. Markers count row by row from ``first_id``. ``legacy``: OpenCV
+    before 4.6 drew boards of an even number of rows with a white square in the upper left corner.
     """
 
     marker_m: float
@@ -152,21 +128,11 @@ class Charuco(_Squares):
 class AprilGrid(_Grid):
     """Tags in rows and columns with a black square between the corners of each four: Kalibr's AprilGrid.
 
-    Tags count from the lower left one, to the right and then up. So do corners, row by row over all tags:
-    corner 0 is the lower left corner of the first tag, corner 2 * columns the one over it.
-
-    Attributes
-    ----------
-    tag_m
-        Side of a tag, black border included.
-    gap_m
-        White between two tags; the side of the black squares. Kalibr's ``tagSpacing`` is gap_m / tag_m.
-    family
-        ``tag36h11``, ``tag25h9`` or ``tag16h5``.
-    first_id
-        The lower left tag.
-    border
-        Width of a tag's black border in its own cells; Kalibr draws 2, AprilTag's own pictures have 1.
+    Tags count from the lower left one (``first_id``), to the right and then up. So do corners, row by row
+    over all tags: corner 0 is the lower left corner of the first tag, corner 2 * columns the one over it.
+    ``tag_m`` is with the black border, ``gap_m`` the white between two tags and the side of the black
+    squares; Kalibr's ``tagSpacing`` is gap_m / tag_m. ``border`` is the width of the black border in a tag's
+    cells; Kalibr draws 2, AprilTag's own pictures have 1.
     """
 
     tag_m: float
@@ -232,14 +198,8 @@ def _even(count: int, step_m: float) -> FloatArray:
 class Corners:
     """Corners of one board in one image; arrays are read-only.
 
-    Attributes
-    ----------
-    ids
-        (n,) as the board counts them, each once.
-    pixels_px
-        (n, 2); the centre of the top-left pixel is (0, 0). Of a dot: the image of its centre.
-    sigma_px
-        (n,) one standard deviation of a corner, each axis.
+    ``ids`` (n,) as the board counts them, each once; ``pixels_px`` (n, 2), of a dot the image of its centre;
+    ``sigma_px`` (n,) one standard deviation, each axis.
     """
 
     ids: IntArray
@@ -270,16 +230,10 @@ class CornersNotFound(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Board:
-    """The dot board; its frame has the origin at the grid's centre, x along a row, y down a column.
+    """The dot board of a survey; its frame has the origin at the grid's centre, x along a row, y down a
+    column.
 
-    Attributes
-    ----------
-    rows, columns
-        Number of dots down and across.
-    spacing_m, dot_diameter_m
-        Metres.
-    tapes_in_board_m
-        Name of a tape to its place (3,) in the board frame, metres.
+    ``tapes_in_board_m`` maps the name of a tape to its place (3,), metres.
     """
 
     rows: int
@@ -303,16 +257,9 @@ NO_BOARD = Board(0, 0, 0.0, 0.0, {})
 class Dots:
     """Dots found in one image.
 
-    Attributes
-    ----------
-    rows, columns
-        (n,) from 0.
-    pixels_px
-        (n, 2) the images of the dots' centres.
-    sigma_px
-        (n,) one standard deviation of a dot, each axis; None where it was not measured.
-    residual_px
-        Rms distance per axis to a smooth map of the board; not-a-number where none was fitted.
+    ``rows`` and ``columns`` (n,) from 0; ``pixels_px`` (n, 2) the images of the dots' centres; ``sigma_px``
+    (n,) one standard deviation, each axis, None where it was not measured; ``residual_px`` the rms distance
+    per axis to a smooth map of the board, not-a-number where none was fitted.
     """
 
     rows: IntArray

@@ -241,23 +241,9 @@ def find_corners(board: AnyBoard, image: Levels) -> Corners | CornersNotFound:
     Part of a board is enough where its markers show which part. Chessboards and dots must be seen whole,
     their upper side up in the image unless the print shows it.
 
-    Parameters
-    ----------
-    board
-        What is printed.
-    image
-        (h, w) or (h, w, 3) levels of 8 or 16 bits; the centre of the top-left pixel is (0, 0).
-
-    Returns
-    -------
-    Corners | CornersNotFound
-        sigma_px is the uncertainty of each corner from noise, blur and slant, by the residuals of its grey
-        levels. Errors that neighbours share, such as the print's, are not in it.
-
-    Raises
-    ------
-    ValueError
-        If the image is none of these.
+    ``image`` is (h, w) or (h, w, 3) levels of 8 or 16 bits (else ValueError); the centre of the top-left
+    pixel is (0, 0). A corner's sigma is from noise, blur and slant, by the residuals of its grey levels;
+    errors that neighbours share, such as the print's, are not in it.
     """
     levels = _grey(image)
     eight = in_8_bits(levels)
@@ -349,9 +335,7 @@ def _fitted(
 
 
 def _insets_m(board: Charuco | AprilGrid | Checkerboard) -> FloatArray:
-    """How far from a corner, across and down, markers begin in the white squares; infinite if there are
-    none.
-    """
+    """How far from a corner, across and down, markers begin in the white squares; infinite: nowhere."""
     if not isinstance(board, Charuco):
         return np.full(2, np.inf)
     return (board.square_m - board.marker_m) / 2 * np.array([1.0, board.aspect])

@@ -68,10 +68,20 @@ class PlaneMap:
         return 8 + 2 * max(0, len(self.bend) - 4)
 
 
-def carried(homography: FloatArray, points: FloatArray) -> FloatArray:
+def carried(matrix: FloatArray, points: FloatArray) -> FloatArray:
     """Return points (..., 2) after a homography (3, 3)."""
-    whole = points @ homography[:, :2].T + homography[:, 2]
+    whole = points @ matrix[:, :2].T + matrix[:, 2]
     return np.asarray(whole[..., :2] / whole[..., 2:])
+
+
+def homography(points: FloatArray, pixels: FloatArray, within_px: float = 0.0) -> FloatArray | None:
+    """Return the (3, 3) that carries points (n, 2) to pixels (n, 2); None if they determine none.
+
+    Where some may be wrong, ``within_px`` is how far off the others are at most.
+    """
+    method = cv2.RANSAC if within_px else 0
+    H, _ = cv2.findHomography(points, pixels, method, within_px or 3.0, maxIters=4000)
+    return None if H is None or not np.isfinite(H).all() else np.asarray(H, dtype=np.float64)
 
 
 def fit_plane_map(points_m: FloatArray, pixels_px: FloatArray) -> PlaneMap | None:
@@ -80,20 +90,20 @@ def fit_plane_map(points_m: FloatArray, pixels_px: FloatArray) -> PlaneMap | Non
         return None
     scale = float(np.abs(points_m).max())
     middle = pixels_px.mean(axis=0)
-    H, _ = cv2.findHomography(points_m / scale, pixels_px - middle, 0)
-    if H is None or not np.isfinite(H).all():
+    H = homography(points_m / scale, pixels_px - middle)
+    if H is None:
         return None
     back = np.array([[1.0, 0.0, middle[0]], [0.0, 1.0, middle[1]], [0.0, 0.0, 1.0]])
-    homography = np.asarray(back @ H @ np.diag([1 / scale, 1 / scale, 1.0]), dtype=np.float64)
+    whole = np.asarray(back @ H @ np.diag([1 / scale, 1 / scale, 1.0]), dtype=np.float64)
     degree = max(d for d, least in zip(DEGREES, DOTS_FOR_DEGREE, strict=True) if len(points_m) >= least)
-    flat = PlaneMap(homography, np.empty((0, 2)), 0, scale)
+    flat = PlaneMap(whole, np.empty((0, 2)), 0, scale)
     if not degree:
         return flat
     powers = _powers(points_m / scale, degree)
     bend, _, rank, _ = np.linalg.lstsq(powers, pixels_px - flat.pixels(points_m), rcond=1e-9)
     if rank < powers.shape[1]:
         return flat
-    return PlaneMap(homography, np.asarray(bend, dtype=np.float64), degree, scale)
+    return PlaneMap(whole, np.asarray(bend, dtype=np.float64), degree, scale)
 
 
 def _powers(points: FloatArray, degree: int) -> FloatArray:

@@ -61,16 +61,9 @@ class DotCentres(NamedTuple):
 
 
 def fit_ellipses(image: Levels, middles_px: FloatArray, shapes_px: FloatArray) -> DotCentres:
-    """Fit dots whose places are known to a pixel.
+    """Fit dots whose places ``middles_px`` (n, 2) are known to a pixel.
 
-    Parameters
-    ----------
-    image
-        (h, w) grey levels.
-    middles_px
-        (n, 2) about where the dots are.
-    shapes_px
-        (n, 2, 2) carry the unit circle to each dot's outline; only their size is corrected.
+    ``shapes_px`` (n, 2, 2) carry the unit circle to each dot's outline; only their size is corrected.
     """
     u, levels, weights = _patches(image, middles_px, shapes_px)
     undo = np.linalg.inv(shapes_px)
@@ -118,7 +111,7 @@ def fit_ellipses(image: Levels, middles_px: FloatArray, shapes_px: FloatArray) -
 def centred(image: Grey8, middles_px: FloatArray, shapes_px: FloatArray) -> FloatArray:
     """Return the middles moved onto the dark spots that they are nearest to, good to some tenths of a pixel.
 
-    Arguments as ``fit_ellipses``, but places may be off by most of a dot's radius.
+    Places may be off by most of a dot's radius; shapes as for ``fit_ellipses``.
     """
     middles = middles_px
     for _ in range(3):
@@ -222,13 +215,6 @@ def area_centroids(boundaries_px: ArrayLike) -> FloatArray:
     return np.asarray(middle + moments / (2 * area[:, None]))
 
 
-def outline_points_m(centres_m: ArrayLike, radius_m: float) -> FloatArray:
-    """Return boundary points (n, 32, 2) of circles about ``centres_m`` (n, 2), all in the circles' plane."""
-    angle = np.arange(BOUNDARY_POINTS) * (2.0 * np.pi / BOUNDARY_POINTS)
-    around = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    return np.asarray(np.asarray(centres_m, dtype=np.float64)[:, None, :] + around)
-
-
 def bias_through(
     pixel_of: Callable[[FloatArray], FloatArray], centres_m: ArrayLike, radius_m: float
 ) -> FloatArray:
@@ -238,5 +224,7 @@ def bias_through(
     metres. Not-a-number where the map has no pixel for some point of the boundary.
     """
     centres = np.asarray(centres_m, dtype=np.float64)
-    boundaries = pixel_of(outline_points_m(centres, radius_m))
+    angle = np.arange(BOUNDARY_POINTS) * (2.0 * np.pi / BOUNDARY_POINTS)
+    around = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    boundaries = pixel_of(centres[:, None, :] + around)
     return np.asarray(area_centroids(boundaries) - pixel_of(centres))

@@ -10,12 +10,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray, IntArray, Rigid
 from calib.targets.boards import Board, Grey8
+from calib.targets.dot_grid import homography
 from calib.targets.dot_spots import UNEVEN, UNEVEN_AT_MOST
 
 SURE_RAD = np.radians(32.0)
@@ -38,21 +38,9 @@ def order_by_steps(
 ) -> Ordered | None:
     """Count rows and columns so that their directions in the image are nearest to the expected ones.
 
-    Parameters
-    ----------
-    places
-        (n, 2), i and j of each dot, 0 to ``counts`` - 1.
-    steps_px
-        (2, 2), the steps of i and of j in the image, as columns.
-    board
-        Gives the number of rows and columns.
-    expected_px
-        (2, 2), where the steps of columns and of rows are expected to point, as columns.
-
-    Returns
-    -------
-    ordered
-        None if no way to count fits within ``SURE_RAD``.
+    ``places`` (n, 2) are i and j of each dot, 0 to ``counts`` - 1; ``steps_px`` (2, 2) the steps of i and j
+    in the image, as columns; ``expected_px`` (2, 2) where the steps of columns and rows should point, as
+    columns. None if no way to count fits within ``SURE_RAD``.
     """
     orders: list[Ordered] = []
     for columns, rows, c_from_ij in _countings(places, counts, board):
@@ -74,20 +62,12 @@ def order_by_gravity(
 ) -> Ordered | None:
     """Count rows and columns so that the camera that took the picture stands upright.
 
-    Parameters
-    ----------
-    middles_px
-        (n, 2) of the dots.
-    camera
-        A rough camera in its own frame: x right, y down, z along A.
-    down_in_board
-        (3,), the direction in the board's frame that is down in an upright camera's image.
-
-    Other arguments and the result as ``order_by_steps``. None also if the camera looks down so steeply that
-    its uprightness shows nothing.
+    ``camera`` is a rough one in its own frame (x right, y down, z along A); ``down_in_board`` (3,) is the
+    direction in the board's frame that is down in an upright camera's image. Other arguments and the result
+    as ``order_by_steps``. None also if the camera looks down so steeply that its uprightness shows nothing.
     """
-    homography = _camera_from_places(camera, places, middles_px)
-    if homography is None:
+    from_places = _camera_from_places(camera, places, middles_px)
+    if from_places is None:
         return None
     orders: list[Ordered] = []
     for columns, rows, c_from_ij in _countings(places, counts, board):
@@ -96,7 +76,7 @@ def order_by_gravity(
         middle = np.array([board.columns - 1, board.rows - 1]) / 2
         affine[:2, :2] = np.linalg.inv(c_from_ij) / board.spacing_m
         affine[:2, 2] = np.linalg.inv(c_from_ij) @ (middle - shift)
-        H = homography @ affine
+        H = from_places @ affine
         H = H / np.linalg.norm(H[:, 0])
         if np.linalg.det(H) <= 0.0:  # seen from behind
             continue
@@ -125,8 +105,8 @@ def _camera_from_places(camera: CameraModel, places: IntArray, middles_px: Float
     across = np.linalg.svd(ahead[None])[2][1:]
     frame = np.array([*across, ahead / np.linalg.norm(ahead)])
     turned = rays.directions @ frame.T
-    H, _ = cv2.findHomography(places.astype(np.float64), turned[:, :2] / turned[:, 2:], 0)
-    if H is None or not np.isfinite(H).all():
+    H = homography(places.astype(np.float64), turned[:, :2] / turned[:, 2:])
+    if H is None:
         return None
     depth = places.mean(axis=0) @ H[2, :2] + H[2, 2]
     return np.asarray(frame.T @ H * np.sign(depth), dtype=np.float64)
@@ -181,11 +161,7 @@ class PredictedBoard:
 
 @dataclass(frozen=True, eq=False)
 class Upright:
-    """Only that the camera stands upright.
-
-    ``camera`` is a rough one in its own frame (x right, y down, z along A). ``down_in_board`` (3,) is the
-    direction in the board's frame that is down in an upright camera's image.
-    """
+    """Only that the camera stands upright; ``camera`` and ``down_in_board`` as for ``order_by_gravity``."""
 
     camera: CameraModel
     down_in_board: FloatArray

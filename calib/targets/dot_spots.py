@@ -39,16 +39,9 @@ def dot_candidates(
 ) -> Candidates:
     """Return the spots that look like dots.
 
-    Parameters
-    ----------
-    image
-        (h, w) grey levels.
-    diameter_px
-        Of the largest dot to be found, along its longer axis; sets the window in which paper is looked for.
-    area_px2
-        Smallest and largest area of a dot.
-    uneven
-        How uneven the paper around a dot may be, in units of its contrast to the dot.
+    ``diameter_px`` is that of the largest dot to be found, along its longer axis; it sets the window in which
+    paper is looked for. ``area_px2`` are a dot's smallest and largest area, ``uneven`` how uneven the paper
+    around it may be, in units of its contrast to the dot.
     """
     smooth = np.asarray(cv2.GaussianBlur(image, (0, 0), min(0.8, 0.08 * diameter_px)), dtype=np.uint8)
     window = 2 * int(np.ceil(0.8 * diameter_px + 1)) + 1

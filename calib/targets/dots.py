@@ -26,6 +26,7 @@ from calib.targets.dot_order import (
 )
 from calib.targets.dot_spots import Candidates, dot_candidates
 
+UNSURE = "the grid is found but not which corner is the first: it stands aslant against"
 SMALLEST_DOT_PX = 3.5
 
 LEAST_SIGMA_PX = 0.003
@@ -40,23 +41,14 @@ def find_dots(
 ) -> Dots | CornersNotFound:
     """Return the dots of the board in an image, or why there are none.
 
-    Parameters
-    ----------
-    image
-        (h, w) grey levels of 8 or 16 bits; the centre of the top-left pixel is (0, 0). Of 16 bits all count
-        where dots are measured; they are looked for in what 8 bits hold of the levels that occur.
-    board
-        Rows, columns, spacing and diameter.
-    expected
-        ``PredictedBoard``, good to 20 cm and 10 degrees, gives the part of the image that is searched first,
-        the size of dots and the order of rows and columns. Without it the whole image is searched for dots of
-        any size. Rows and columns are then counted so that the camera stands upright (``Upright``), or rows
-        run to the right in the image (None). An order that is not sure is a failure.
+    ``image`` is (h, w) grey levels of 8 or 16 bits (else ValueError); the centre of the top-left pixel is (0,
+    0). Of 16 bits all count where dots are measured; they are looked for in what 8 bits hold of the levels
+    that occur.
 
-    Raises
-    ------
-    ValueError
-        If the image is not a (h, w) array of uint8 or uint16.
+    A ``PredictedBoard``, good to 20 cm and 10 degrees, gives the part of the image that is searched first,
+    the size of dots and the order of rows and columns. Without it the whole image is searched for dots of any
+    size. Rows and columns are then counted so that the camera stands upright (``Upright``), or rows run to
+    the right in the image (None). An order that is not sure is a failure.
     """
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         raise ValueError(f"an image of {image.shape} {image.dtype} where (h, w) uint8 or uint16 is expected")
@@ -77,7 +69,7 @@ def find_dots(
         if isinstance(grid, BoardGrid):
             ordered = _ordered(grid, board, expected, steps_px)
             result = (
-                CornersNotFound(_unsure(steps_px))
+                CornersNotFound(f"{UNSURE} {'the upright' if steps_px is None else 'the predicted pose'}")
                 if ordered is None
                 else _measured(levels, board, grid, ordered)
             )
@@ -99,12 +91,6 @@ def in_8_bits(image: Levels) -> Grey8:
     dark, bright = np.percentile(image, (0.1, 99.9))
     spread = (image - dark) * (255.0 / max(bright - dark, 1.0))
     return np.asarray(np.clip(np.rint(spread), 0, 255), dtype=np.uint8)
-
-
-def _unsure(steps_px: FloatArray | None) -> str:
-    """A sentence about an order that could be another."""
-    against = "the upright" if steps_px is None else "the predicted pose"
-    return f"the grid is found but not which corner is the first: it stands aslant against {against}"
 
 
 def _ordered(

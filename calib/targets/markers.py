@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from calib.geometry.rigid import FloatArray, IntArray
 from calib.targets.board_file import FAMILIES
 from calib.targets.boards import AprilGrid, Charuco, Checkerboard, Grey8
-from calib.targets.dot_grid import carried
+from calib.targets.dot_grid import carried, homography
 
 NEIGHBOURS = 16
 FEWEST_NEIGHBOURS = 4
@@ -28,9 +28,9 @@ NEXT = 1.3
 
 @dataclass(frozen=True, eq=False)
 class MeasuredCorners:
-    """Points of a board, and where they are in the image.
+    """Points of a board (n, 2), metres, and where they are in the image, pixels (n, 2).
 
-    points_m, pixels_px (n, 2); where they were predicted as corners, ids (n,) and jacobians (n, 2, 2) px/m.
+    Where they were predicted as corners: ids (n,) and jacobians (n, 2, 2) px/m.
     """
 
     points_m: FloatArray
@@ -124,15 +124,11 @@ class Markers(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlacedMarkers:
-    """Markers that stand as on the board, each id once.
-
-    ids (n,); corners_px (n, 4, 2); corners_m (n, 4, 2) on the board; homography (3, 3) from metres to pixels.
-    """
+    """Markers that stand as on the board, each id once: ids (n,), corners (n, 4, 2) in pixels and metres."""
 
     ids: IntArray
     corners_px: FloatArray
     corners_m: FloatArray
-    homography: FloatArray
 
 
 def detect(image: Grey8, board: MarkerBoard) -> Markers:
@@ -204,23 +200,18 @@ def placed_markers(markers: Markers, board: MarkerBoard) -> PlacedMarkers | None
         return None
     metres = on_board[ids]
     sides_px = np.linalg.norm(np.diff(pixels, axis=1, append=pixels[:, :1]), axis=-1).mean(axis=1)
-    H, _ = cv2.findHomography(
-        metres.reshape(-1, 2),
-        pixels.reshape(-1, 2),
-        cv2.RANSAC,
-        STANDS_WITHIN * float(np.median(sides_px)),
-        maxIters=4000,
-    )
-    if H is None or not np.isfinite(H).all():
+    within_px = STANDS_WITHIN * float(np.median(sides_px))
+    H = homography(metres.reshape(-1, 2), pixels.reshape(-1, 2), within_px)
+    if H is None:
         return None
-    off = np.linalg.norm(carried(np.asarray(H, dtype=np.float64), metres) - pixels, axis=-1).max(axis=1)
+    off = np.linalg.norm(carried(H, metres) - pixels, axis=-1).max(axis=1)
     keep = off < STANDS_WITHIN * np.maximum(sides_px, 6.0)
     nearest = np.lexsort((off, ids))
     first = nearest[np.unique(ids[nearest], return_index=True)[1]]
     keep &= np.isin(np.arange(len(ids)), first)
     if keep.sum() < FEWEST:
         return None
-    return PlacedMarkers(ids[keep], pixels[keep], metres[keep], np.asarray(H))
+    return PlacedMarkers(ids[keep], pixels[keep], metres[keep])
 
 
 def _white_first(board: Charuco) -> bool:

@@ -21,12 +21,8 @@ Rectangle = tuple[float, float, float, float]
 class Cells:
     """A plane cut by lines into cells, each black or white; white beyond the outermost lines.
 
-    Attributes
-    ----------
-    x_m, y_m
-        (m + 1,) and (n + 1,) the lines, ascending, metres in the board frame.
-    black
-        (n, m).
+    ``x_m`` (m + 1,) and ``y_m`` (n + 1,) are the lines, ascending, metres in the board frame; ``black`` is
+    (n, m).
     """
 
     x_m: FloatArray
@@ -55,16 +51,8 @@ class Cells:
 
 @dataclass(frozen=True, eq=False)
 class Spots:
-    """Black dots on white.
-
-    Attributes
-    ----------
-    x_m, y_m
-        Where their columns and rows are, evenly apart, metres in the board frame.
-    diameter_m
-        Of a dot, across.
-    aspect
-        Its height over its width.
+    """Black dots on white, their columns and rows evenly apart, metres in the board frame; aspect is height
+    over width.
     """
 
     x_m: FloatArray

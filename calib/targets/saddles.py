@@ -58,16 +58,9 @@ def residuals(
 ) -> tuple[FloatArray, FloatArray]:
     """Return what the model leaves of grey levels (n, p), and the model's derivatives (n, p, 11).
 
-    Parameters
-    ----------
-    state
-        (n, 11) parameters.
-    u, levels, weights
-        (n, p, 2) pixels from where the corners were expected; (n, p) grey levels; (n, p) weights of both
-        answers.
-    insets
-        (n, 3): so far from either edge, pixels, a marker begins (infinite: none), and the sign of the quarter
-        right of and below the corner, +1 where it is white.
+    ``state`` (n, 11) are the parameters, ``u`` (n, p, 2) pixels from where the corners were expected,
+    ``weights`` (n, p) those of both answers. ``insets`` (n, 3): so far from either edge, pixels, a marker
+    begins (infinite: none), and the sign of the quarter right of and below the corner, +1 where it is white.
     """
     away = u - state[:, None, :2]
     J = np.empty((*levels.shape, PARAMETERS))
@@ -174,9 +167,7 @@ border that is printed a little elsewhere does no harm."""
 
 
 class Crossings(NamedTuple):
-    """Corners on a print: points_m (n, 2); inset_m (2,): so far from a corner, across and down, markers
-    begin.
-    """
+    """Corners on a print, points_m (n, 2); markers begin inset_m (2,) from a corner, across and down."""
 
     pattern: Cells
     points_m: FloatArray
@@ -194,9 +185,7 @@ class Crossings(NamedTuple):
 
 
 class Pixels(NamedTuple):
-    """Windows about corners: u (n, p, 2), pixels from where these are expected; levels (n, p); weights (n,
-    p).
-    """
+    """Windows about corners: u (n, p, 2), pixels from where these are expected; levels and weights (n, p)."""
 
     u: FloatArray
     levels: FloatArray
@@ -223,9 +212,7 @@ def pixels_about(
 
 
 def sharpness_px(image: Levels, pixels_px: FloatArray) -> FloatArray:
-    """Return about the standard deviation (n,) of what blurs edges in the windows, by how steep the
-    steepest are.
-    """
+    """Return about the standard deviation (n,) of what blurs edges in windows, by their steepest slopes."""
     columns, rows, _ = _window(image, pixels_px)
     side = 2 * HALF_PX + 1
     levels = image[rows, columns].astype(np.float64).reshape(-1, side, side)
@@ -306,20 +293,10 @@ class Saddles(NamedTuple):
 def fit_saddles(
     image: Levels, crossings: Crossings, pixels_px: FloatArray, jacobians: FloatArray, farthest_px: float
 ) -> Saddles:
-    """Fit corners whose places are known to a pixel or two.
+    """Fit corners whose places ``pixels_px`` (n, 2) are known to a pixel or two, ``jacobians`` (n, 2, 2)
+    px/m.
 
-    Parameters
-    ----------
-    image
-        (h, w) grey levels.
-    crossings
-        The n corners on the print.
-    pixels_px
-        (n, 2) about where they are.
-    jacobians
-        (n, 2, 2) d pixel / d metre there.
-    farthest_px
-        A fit that moves farther has found another corner, and counts as none.
+    A fit that moves farther than ``farthest_px`` has found another corner, and is none.
     """
     if not len(pixels_px):
         nothing = np.empty(0)

@@ -24,7 +24,7 @@ from calib.files import CameraFile
 from calib.files.cahvor_text import format_cahvor, parse_cahvor
 from calib.files.mast_file import StoredRig, parse_camera, parse_rig, save_camera
 from calib.files.mrcal_kalibr import parse_kalibr, parse_mrcal
-from calib.files.opencv_ros import Reading, parse_calibration
+from calib.files.opencv_ros import parse_calibration
 from calib.files.tables import parse_table
 from calib.geometry.cahvor import FREE
 from calib.survey.check import check_survey
@@ -193,10 +193,9 @@ def _use_rig(stored: StoredRig) -> None:
         _use_model(CameraFile(stored.rig.camera_in_rover(name, 0.3, -0.2), "rover"))
 
 
-def _use_all(readings: Mapping[str, Reading]) -> None:
-    for one in readings.values():
-        if isinstance(one, CameraFile):
-            _use_model(one)
+def _use_all(cameras: Mapping[str, CameraFile]) -> None:
+    for one in cameras.values():
+        _use_model(one)
 
 
 def _product(data: bytes, path: str) -> None:

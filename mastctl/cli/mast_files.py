@@ -11,7 +11,6 @@ from mastctl.cli import output
 
 if TYPE_CHECKING:
     from calib.files import CameraFile
-    from calib.files.any_camera import CameraFiles
     from calib.files.mast_file import StoredRig
     from calib.geometry.rig import Rig
 
@@ -77,23 +76,22 @@ def chosen_camera(path: Path, name: str | None) -> tuple[str, CameraFile]:
     return found, camera
 
 
-def camera_of(source: StoredRig | CameraFile | CameraFiles, name: str | None) -> tuple[str, CameraFile]:
+def camera_of(
+    source: StoredRig | CameraFile | dict[str, CameraFile], name: str | None
+) -> tuple[str, CameraFile]:
     """Return the camera that is meant, and its name. Raises WrongUse."""
     from calib.files import CameraFile
-    from calib.files.any_camera import CameraFiles
 
     if isinstance(source, CameraFile):
         _refuse_name(name)
         return "camera", source
-    if isinstance(source, CameraFiles):
-        cameras = source.names
+    if isinstance(source, dict):
+        path = next(iter(source.values())).path
         if name is None:
-            raise output.WrongUse(
-                f"{source.path} holds several cameras; --camera with one of {', '.join(cameras)}"
-            )
-        if name not in cameras:
-            raise output.WrongUse(f"no camera '{name}' in {source.path}; {nearest_of(name, cameras)}")
-        return name, source.camera(name)
+            raise output.WrongUse(f"{path} holds several cameras; --camera with one of {', '.join(source)}")
+        if name not in source:
+            raise output.WrongUse(f"no camera '{name}' in {path}; {nearest_of(name, source)}")
+        return name, source[name]
     name = camera_name(source, name)
     camera = source.rig.cameras[name]
     provenance = {"mast_file_sha256": source.digest, **source.rig.provenance}

@@ -16,7 +16,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from calib.files.opencv_ros import lens_pose
+from calib.files.foreign import lens_pose
 from calib.files.twin import TwinError, even_axes, nearest_opencv, twin_error
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig, RigCamera

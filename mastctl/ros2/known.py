@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from calib.files.any_camera import nearest_lens
-from calib.files.opencv_ros import lens_pose
+from calib.files.foreign import lens_pose
 from calib.files.twin import TwinError, even_axes
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig

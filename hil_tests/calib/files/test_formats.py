@@ -295,13 +295,6 @@ def test_a_covariance_that_is_none_is_refused() -> None:
     assert len(parameter_order("CAHVORE")) == 21
 
 
-def test_derived_values_that_contradict_the_vectors_are_told() -> None:
-    text = _jpl_text().replace("Hs    =   1290.0", "Hs    =   1291.0")
-    assert parse_cahvor(text.encode(), "x").notes == (
-        "Hs = 1291 in the file, 1290 by its vectors, which count",
-    )
-
-
 def test_formats_are_told_by_content_whatever_the_name(tmp_path: Path) -> None:
     for name, data, expected in (
         ("a.txt", MAST_TEXT.encode(), "rig"),

@@ -17,7 +17,7 @@ import yaml
 
 from calib.errors import BadFile
 from calib.files import CameraFile
-from calib.files.any_camera import CameraFiles, load_any, save_any
+from calib.files.any_camera import load_any, save_any
 from calib.files.mast_file import load_rig
 from calib.files.mrcal_kalibr import format_mrcal, parse_mrcal
 from calib.files.twin import twin_error
@@ -281,8 +281,7 @@ def test_a_message_of_ros_is_read_as_its_file_is(tmp_path: Path) -> None:
 
 def test_a_chain_of_kalibr_places_each_camera_against_the_one_before(tmp_path: Path) -> None:
     cameras = read(tmp_path, "chain.yaml", CHAIN)
-    assert isinstance(cameras, CameraFiles)
-    first, second = (cameras.cameras[name] for name in ("cam0", "cam1"))
+    first, second = (cameras[name] for name in ("cam0", "cam1"))
     assert first.frame == second.frame == "cam0"
     # x in cam1 = T x in cam0; cam1's origin is where T x is zero: x = -R^T t
     np.testing.assert_allclose(second.model.C, [0.003, -0.002, 0.11], atol=1e-12)
@@ -301,8 +300,8 @@ def test_a_pair_goes_to_kalibr_and_back_with_its_baseline(tmp_path: Path) -> Non
     assert np.linalg.norm(step[:3, 3]) == pytest.approx(baseline_m, abs=1e-9)
     assert step[0, 3] == pytest.approx(-baseline_m, abs=0.01)  # the left one lies to the right one's left
     again = load_any(tmp_path / "pair.kalibr.yaml")
-    assert isinstance(again, CameraFiles)
-    for name, camera in zip(pair, again.cameras.values(), strict=True):
+    assert isinstance(again, dict)
+    for name, camera in zip(pair, again.values(), strict=True):
         assert twin_error(pair[name].model, camera.model).worst_px < 0.25
     with pytest.raises(BadFile, match="several frames"):
         save_any(pair | {"hazcam_left": reference("hazcam_left")}, tmp_path / "all.kalibr.yaml", limit_px=5)
@@ -382,7 +381,12 @@ def test_what_mrcal_wrote_beside_the_camera_is_not_read(tmp_path: Path) -> None:
         ("cv.yml", "camera_matrix:", "matrix:", "camera_matrix: the key is missing"),
         ("cv.yml", "image_width: 640\n", "", "image_width: the key is missing"),
         ("chain.yaml", "cam1", "cam2", "cam0, cam1, ... in order"),
-        ("chain.yaml", "camera_model: pinhole", "camera_model: omni", "only 'pinhole' is read"),
+        (
+            "chain.yaml",
+            "camera_model: pinhole",
+            "camera_model: omni",
+            "cam0.camera_model: the text 'omni' where 'pinhole' is",
+        ),
         ("chain.yaml", "radtan", "fov", "one of radtan, equidistant, none"),
         ("chain.yaml", "[0, 0, 1, -0.11]", "[0, 0, 2, -0.11]", "no rotation and translation"),
         (
@@ -402,9 +406,7 @@ def test_a_bad_file_is_refused_in_one_sentence(
 ) -> None:
     assert old in TEXTS[name]
     with pytest.raises(BadFile) as refused:
-        found = read(tmp_path, name, TEXTS[name].replace(old, new, 1))
-        for camera in found.names:
-            found.camera(camera)
+        read(tmp_path, name, TEXTS[name].replace(old, new, 1))
     assert phrase in str(refused.value)
     assert "\n" not in str(refused.value)
 

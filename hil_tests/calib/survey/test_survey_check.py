@@ -373,28 +373,11 @@ def test_one_wrong_prism_is_no_matter_of_units(good: Survey, shift_m: float) -> 
     assert "prism p2" in finding.message
 
 
-def test_copies_are_named(good: Survey) -> None:
+def test_images_that_share_their_dots_are_named(good: Survey) -> None:
     first, second = good.images[0].name, good.images[2].name
     dots = dict(good.dots) | {second: good.dots[first]}
     copied = [f for f in check_survey(replace(good, dots=dots)) if "very same" in f.message]
     assert f"those of image {first}" in only(tuple(copied)).message
-    place = next(p.position_m for p in good.station if p.placement == "mast-1")
-    changed = with_station(
-        good, lambda p: replace(p, position_m=place) if (p.placement, p.point) == ("mast-2", "a") else p
-    )
-    copied = [f for f in check_survey(changed) if "is a copy" in f.advice]
-    assert "has the coordinates of tape a mast-1" in only(tuple(copied)).message
-
-
-def test_a_dot_found_twice_is_named(good: Survey) -> None:
-    name = good.images[0].name
-    pixels = good.dots[name].pixels_px.copy()
-    pixels[17] = pixels[16] + (0.5, 0)
-    dots = dict(good.dots) | {name: replace(good.dots[name], pixels_px=pixels)}
-    finding = only(check_survey(replace(good, dots=dots)))
-    assert "(row 1, column 6)" in finding.message
-    assert "(row 1, column 7)" in finding.message
-    assert "0.50 px apart" in finding.message
 
 
 def test_it_answers_for_any_survey_that_can_be_read(good: Survey) -> None:
