@@ -163,9 +163,9 @@ def _blurred(image: Grey8) -> str:
         widths.append(float(np.sqrt(max(spread**2 - SMOOTH_PX**2, 0.0))))
     across, down = widths
     if max(widths) > BLURRED_PX and max(widths) > SMEARED * min(widths):
-        way = "across" if across > down else "down"
+        direction = "across" if across > down else "down"
         wide = f"its sharpest edges that way are spread over {2 * max(widths):.0f} px"
-        return f"no board can be read; the picture moved {way} during its exposure: {wide}"
+        return f"no board can be read; the picture moved {direction} during its exposure: {wide}"
     if min(widths) > BLURRED_PX:
         wide = f"its sharpest edges are spread over {2 * min(widths):.0f} px"
         return f"no board can be read; the picture is blurred: {wide}"

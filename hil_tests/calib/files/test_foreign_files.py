@@ -289,7 +289,8 @@ def test_a_bad_side_of_a_stereo_file_is_named(tmp_path: Path) -> None:
 MESSAGE = (
     "header:\n  stamp: {sec: %d, nanosec: 2}\n  frame_id: left\nheight: 480\nwidth: 640\n"
     "distortion_model: plumb_bob\nd: [-0.2, 0.05, 0.001, -0.0007, %g]\n"
-    f"k: {K_ROW}\nr: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nbinning_x: 0\nbinning_y: 0\n---\n"
+    f"k: {K_ROW}\nr: [1, 0, 0, 0, 1, 0, 0, 0, 1]\nbinning_x: 0\nbinning_y: 0\n"
+    "p: [300, 0, 320, 0, 0, 300, 240, 0, 0, 0, 1, 0]\nroi: {x_offset: 0, do_rectify: false}\n---\n"
 )
 
 

@@ -112,7 +112,7 @@ def test_a_file_of_mrcals_writer_is_read_and_what_is_not_read_is_said() -> None:
         ("CAHVORE3 , .5", "CAHVORE", 3, 0.5),
     ],
 )
-def test_the_three_types_of_cahvore_are_told_apart(
+def test_the_three_types_of_cahvore_are_distinguished(
     model: str, kind: str, cahvore_type: int, linearity: float
 ) -> None:
     text = MRCAL_TEXT.replace("CAHVORE3,0.37 = general", model)
@@ -167,8 +167,8 @@ class _JplScanner:
         self.at = found + len(key)
 
     def numbers(self, count: int) -> list[float]:
-        words = self.text[self.at :].split()[:count]
-        return [float(word) for word in words]
+        numbers = self.text[self.at :].split()[:count]
+        return [float(word) for word in numbers]
 
 
 def _vector_models(reference_data: Path) -> list[tuple[str, dict[str, Any]]]:
@@ -176,19 +176,19 @@ def _vector_models(reference_data: Path) -> list[tuple[str, dict[str, Any]]]:
     return [(file.stem, json.loads(file.read_text())["model"]) for file in files]
 
 
-def _model_of(words: dict[str, Any]) -> CameraModel:
-    kind = words["model_type"]
+def _model_of(numbers: dict[str, Any]) -> CameraModel:
+    kind = numbers["model_type"]
     extra = {}
     if kind == "CAHVORE":
-        extra = {"E": words["E"], "cahvore_type": int(words["T"]), "linearity": float(words["P"])}
-    vectors = [words[letter] for letter in "CAHVOR"]
-    return CameraModel(kind, (words["width"], words["height"]), *vectors, **extra)
+        extra = {"E": numbers["E"], "cahvore_type": int(numbers["T"]), "linearity": float(numbers["P"])}
+    vectors = [numbers[letter] for letter in "CAHVOR"]
+    return CameraModel(kind, (numbers["width"], numbers["height"]), *vectors, **extra)
 
 
 def test_flown_cameras_go_through_every_format_unchanged(reference_data: Path, tmp_path: Path) -> None:
     names = []
-    for name, words in _vector_models(reference_data):
-        model = _model_of(words)
+    for name, numbers in _vector_models(reference_data):
+        model = _model_of(numbers)
         names.append(name)
         for suffix in (".cahvor", ".yaml"):
             path = tmp_path / f"{name}{suffix}"
@@ -205,8 +205,8 @@ def test_flown_cameras_go_through_every_format_unchanged(reference_data: Path, t
 
 
 def test_jpls_reader_finds_every_value_in_what_is_written(reference_data: Path) -> None:
-    for name, words in _vector_models(reference_data):
-        model = _model_of(words)
+    for name, numbers in _vector_models(reference_data):
+        model = _model_of(numbers)
         text, _ = format_cahvor(CameraFile(model, "unknown"))
         scanner = _JplScanner(text)
         if model.kind == "CAHVORE":
@@ -295,7 +295,7 @@ def test_a_covariance_that_is_none_is_refused() -> None:
     assert len(parameter_order("CAHVORE")) == 21
 
 
-def test_formats_are_told_by_content_whatever_the_name(tmp_path: Path) -> None:
+def test_formats_are_known_by_content_whatever_the_name(tmp_path: Path) -> None:
     for name, data, expected in (
         ("a.txt", MAST_TEXT.encode(), "rig"),
         ("b.dat", CAMERA_TEXT.encode(), "CAHV"),

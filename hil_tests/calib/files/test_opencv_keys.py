@@ -54,7 +54,7 @@ def test_a_file_read_and_written_is_the_same_to_the_last_bit(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "phrase"),
     [
         ("OPENCV8", "OPENCV9", "cameras.navcam.model: the text 'OPENCV9' where one of CAHV, CAHVOR, CAHVO"),
         (
@@ -75,10 +75,10 @@ def test_a_file_read_and_written_is_the_same_to_the_last_bit(tmp_path: Path) -> 
         ("[0.5, 0.1,", "[0.5, .nan,", "finite"),
     ],
 )
-def test_what_is_no_such_camera_is_refused_by_key(old: str, new: str, words: str, tmp_path: Path) -> None:
+def test_what_is_no_such_camera_is_refused_by_key(old: str, new: str, phrase: str, tmp_path: Path) -> None:
     with pytest.raises(BadFile) as refused:
         load_rig(written(tmp_path, TEXT.replace(old, new, 1)))
-    assert words in str(refused.value)
+    assert phrase in str(refused.value)
 
 
 def test_a_lens_that_sees_hardly_any_of_its_image_is_refused(tmp_path: Path) -> None:

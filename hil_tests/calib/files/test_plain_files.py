@@ -22,19 +22,19 @@ from mastctl.config import load_config
 
 def refusal(read: Callable[[], object]) -> str:
     """Return what a reader says of a pipe; fails where it waits for a writer."""
-    said: list[str] = []
+    answers: list[str] = []
 
     def run() -> None:
         try:
-            said.append(str(read()))
+            answers.append(str(read()))
         except Exception as error:
-            said.append(str(error))
+            answers.append(str(error))
 
     reader = threading.Thread(target=run, daemon=True)
     reader.start()
     reader.join(NET_S)
-    assert said, "it waits for a writer"
-    return said[0]
+    assert answers, "it waits for a writer"
+    return answers[0]
 
 
 READERS: dict[str, Callable[[Path], object]] = {
@@ -53,8 +53,8 @@ READERS: dict[str, Callable[[Path], object]] = {
 def test_a_pipe_in_the_place_of_a_file_is_refused(what: str, writer: str, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     keeps_open = [os.open(tmp_path / "pipe", os.O_RDWR)] if writer == "silent writer" else []
-    said = refusal(lambda: READERS[what](tmp_path / "pipe"))
-    assert "a pipe or a device; a plain file is expected" in said
+    answers = refusal(lambda: READERS[what](tmp_path / "pipe"))
+    assert "a pipe or a device; a plain file is expected" in answers
     for one in keeps_open:
         os.close(one)
 

@@ -294,7 +294,7 @@ def test_plain_words_are_read_as_people_mean_them(word: str, value: Any) -> None
     assert type(found) is type(value)
 
 
-def test_a_and_o_off_unit_length_are_normalised_and_the_shift_is_told() -> None:
+def test_a_and_o_off_unit_length_are_normalised_and_the_shift_is_noted() -> None:
     document = _mast()
     document["cameras"]["navcam_left"]["A"] = [1.0004, 0, 0]
     stored = store.parse_rig(_bytes(document), "rig.yaml")
@@ -308,7 +308,7 @@ def test_a_and_o_off_unit_length_are_normalised_and_the_shift_is_told() -> None:
     assert store.parse_rig(_bytes(document), "rig.yaml").notes == ()
 
 
-def test_a_linearity_that_the_type_overrides_is_told() -> None:
+def test_a_linearity_that_the_type_overrides_is_noted() -> None:
     document = _mast()
     document["cameras"]["hazcam_right"]["linearity"] = 0.37
     stored = store.parse_rig(_bytes(document), "rig.yaml")
@@ -522,7 +522,7 @@ def test_joints_are_read_as_the_contract_writes_them_and_written_the_same(tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("joints", "words"),
+    ("joints", "phrase"),
     [
         ({"pan": {"harmonics_rad": [[0.3, 0.0]]}}, "joints.pan: harmonics_rad change the angle by up to 0.3"),
         ({"pan": {"harmonics_rad": [[0.1]]}}, r"joints.pan.harmonics_rad\[0\]: .*a list of 2 numbers"),
@@ -535,6 +535,6 @@ def test_joints_are_read_as_the_contract_writes_them_and_written_the_same(tmp_pa
         ({"pan": None}, "joints.pan: .*a mapping"),
     ],
 )
-def test_joints_that_make_no_sense_are_refused_by_key(joints: Any, words: str) -> None:
-    with pytest.raises(BadFile, match=words):
+def test_joints_that_make_no_sense_are_refused_by_key(joints: Any, phrase: str) -> None:
+    with pytest.raises(BadFile, match=phrase):
         store.parse_rig(_bytes(_mast() | {"joints": joints}), "rig.yaml")

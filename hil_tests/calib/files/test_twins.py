@@ -60,7 +60,7 @@ def test_a_round_lens_has_an_exact_twin_both_ways() -> None:
     [("none", 1e-9), ("radtan", 0.5), ("plumb_bob", 0.5), ("rational", 0.5), ("turned image", 0.5)],
 )
 @pytest.mark.parametrize("decentred", [False, True])
-def test_the_error_of_a_twin_of_the_cahv_family_is_what_is_told(
+def test_the_error_of_a_twin_of_the_cahv_family_is_what_is_stated(
     name: str, within_px: float, decentred: bool
 ) -> None:
     """p1 and p2 have no place in it but O beside A; without them it comes within 0.05 px."""
@@ -166,9 +166,9 @@ def test_a_lens_is_stored_by_any_family_that_loses_nothing() -> None:
     one = camera(PINHOLE["radtan"])
     assert one.kind == "OPENCV4"
     for kind in ("OPENCV4", "OPENCV5", "OPENCV8", "OPENCV12", "OPENCV14"):
-        held = as_kind(one, kind)  # type: ignore[arg-type]
-        assert held is not None and held.kind == kind
-        assert twin_error(one, held).worst_px < NUMERICAL_PX
+        stored = as_kind(one, kind)  # type: ignore[arg-type]
+        assert stored is not None and stored.kind == kind
+        assert twin_error(one, stored).worst_px < NUMERICAL_PX
     longer = camera([*PINHOLE["radtan"], 0.0, 0.0, 0.0, 0.0])
     back = as_kind(longer, "OPENCV4")
     assert back is not None and twin_error(one, back).worst_px < NUMERICAL_PX

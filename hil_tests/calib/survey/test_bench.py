@@ -108,13 +108,13 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_wrong_is_refused_with_its_place(tmp_path: Path, case: str) -> None:
-    which, old, new, told = CASES[case]
+    which, old, new, expected = CASES[case]
     texts = {"yaml": YAML, "images": IMAGES, "corners": CORNERS}
     assert old in texts[which]
     texts[which] = texts[which].replace(old, new)
     with pytest.raises(BadFile) as error:
         read_survey(folder_of(tmp_path, **texts))
-    assert told in str(error.value)
+    assert expected in str(error.value)
 
 
 def test_a_station_does_not_go_with_boards(tmp_path: Path) -> None:
@@ -172,8 +172,8 @@ def test_a_folder_of_another_bench_is_not_gone_on_with(tmp_path: Path) -> None:
 
 def test_a_folder_does_not_go_on_in_another_sensor_mode(tmp_path: Path) -> None:
     def begun(name: str, mode: SensorMode | None) -> BenchFolder:
-        eye, path = replace(CAMERA, sensor_mode=mode), tmp_path / name
-        return BenchFolder(path, {"wall": BOARD}, Sigma(0, 0, corner_px=0.1), {CAMERA.name: eye}, {})
+        camera, path = replace(CAMERA, sensor_mode=mode), tmp_path / name
+        return BenchFolder(path, {"wall": BOARD}, Sigma(0, 0, corner_px=0.1), {CAMERA.name: camera}, {})
 
     plain, flipped = SensorMode((1024, 768)), SensorMode((1024, 768), flip=(True, False))
     begun("unknown", None)
@@ -218,10 +218,10 @@ def test_a_kill_leaves_images_with_all_corners_or_none(
 
 
 def test_the_check_says_what_a_bench_lacks(tmp_path: Path) -> None:
-    told = "\n".join(map(str, check_survey(read_survey(folder_of(tmp_path)))))
-    assert "images.csv line 4, camera navcam_left: 1 of 2 images have neither corners" in told
-    assert "fewer than 8 corners (one)" in told
-    assert "stood in one place only" in told
+    expected = "\n".join(map(str, check_survey(read_survey(folder_of(tmp_path)))))
+    assert "images.csv line 4, camera navcam_left: 1 of 2 images have neither corners" in expected
+    assert "fewer than 8 corners (one)" in expected
+    assert "stood in one place only" in expected
     empty = "\n".join(map(str, check_survey(read_survey(folder_of(tmp_path / "e", images="", corners="")))))
     assert "camera navcam_left: it has no image" in empty
 

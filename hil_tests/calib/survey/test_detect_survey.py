@@ -63,13 +63,13 @@ def test_every_picture_gives_its_dots_in_their_order(drawn, rough: bool) -> None
         assert len(dots.rows) == 100 and np.sqrt(np.mean(errors**2)) < RMS_PX, name
 
 
-def test_workers_give_the_same_and_tell_how_far_they_are(drawn) -> None:
+def test_workers_give_the_same_and_report_how_far_they_are(drawn) -> None:
     survey, _, _ = drawn
-    here, told = detect_survey(survey), []
+    here, calls = detect_survey(survey), []
     with ProcessPoolExecutor(2) as executor:
-        there = detect_survey(survey, executor, lambda done, of, image: told.append((done, of, image)))
-    assert [(done, of) for done, of, _ in told] == [(k + 1, PICTURES) for k in range(PICTURES)]
-    assert {image for _, _, image in told} == set(here.dots)
+        there = detect_survey(survey, executor, lambda done, of, image: calls.append((done, of, image)))
+    assert [(done, of) for done, of, _ in calls] == [(k + 1, PICTURES) for k in range(PICTURES)]
+    assert {image for _, _, image in calls} == set(here.dots)
     for name, dots in here.dots.items():
         assert np.array_equal(there.dots[name].pixels_px, dots.pixels_px)
 

@@ -65,7 +65,7 @@ def test_windows_line_ends_byte_order_mark_and_blank_end_change_nothing(tmp_path
 Refusal = tuple[str, str, str, str, str]
 
 REFUSALS: dict[str, Refusal] = {
-    # file, what is replaced, by what, place, words of the reason
+    # file, what is replaced, by what, place, part of the reason
     "no such key": ("survey", "stereo:", "stero:", "stero", "nearest known is 'stereo'"),
     "another schema": ("survey", "survey/1", "survey/2", "schema", "'mastctl/survey/1' is expected"),
     "a key is missing": ("survey", "  spacing_m: 0.08\n", "", "board.spacing_m", "missing"),
@@ -150,7 +150,7 @@ REFUSALS: dict[str, Refusal] = {
 
 @pytest.mark.parametrize("case", REFUSALS)
 def test_what_is_wrong_is_refused_with_its_place(tmp_path: Path, case: str) -> None:
-    name, old, new, place, words = REFUSALS[case]
+    name, old, new, place, phrase = REFUSALS[case]
     texts = {key.partition(".")[0]: text for key, text in FILES.items()}
     assert old in texts[name]
     write_files(tmp_path, **{name: texts[name].replace(old, new, 1)})
@@ -158,7 +158,7 @@ def test_what_is_wrong_is_refused_with_its_place(tmp_path: Path, case: str) -> N
         read_survey(tmp_path)
     assert caught.value.path.name.startswith(name)
     assert caught.value.place == place
-    assert words in caught.value.reason
+    assert phrase in caught.value.reason
 
 
 @pytest.mark.parametrize("name", ["survey.yaml", "station.csv", "images.csv"])

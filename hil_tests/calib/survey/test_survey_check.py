@@ -82,7 +82,7 @@ def test_a_camera_without_images(good: Survey) -> None:
     assert (finding.severity, finding.place) == ("error", "camera hazcam_right")
 
 
-def test_an_image_of_a_placement_that_nobody_measured(good: Survey) -> None:
+def test_an_image_of_a_placement_that_was_not_measured(good: Survey) -> None:
     one = next(i for i in good.images if i.placement == "mast-3")
     changed = with_images(good, lambda i: replace(i, placement="mats-3") if i is one else i)
     finding = only(check_survey(changed))
@@ -140,7 +140,7 @@ def test_dots_in_one_part_of_the_picture(good: Survey) -> None:
     assert "x " in finding.message
 
 
-def test_dots_in_one_column_of_cells_ask_for_the_half_that_has_none(good: Survey) -> None:
+def test_dots_in_one_column_of_cells_lead_to_the_half_that_has_none(good: Survey) -> None:
     """All dots right of the middle and left of the last quarter: 0 % of the left half, 50 % of the right."""
     size_px = np.array(good.cameras["navcam_left"].size_px)
     dots = {
@@ -213,8 +213,8 @@ def test_a_station_in_other_units(good: Survey, unit: str, scale: float) -> None
     finding = only(check_survey(changed))
     assert (finding.severity, finding.place) == ("error", "station.csv")
     assert f"station.csv is in {unit}" in finding.message
-    told = float(finding.message.split(" times")[0].split()[-1])
-    assert told == pytest.approx(scale, rel=0.01)
+    named = float(finding.message.split(" times")[0].split()[-1])
+    assert named == pytest.approx(scale, rel=0.01)
 
 
 def test_a_drawing_in_feet(good: Survey) -> None:
@@ -258,7 +258,7 @@ def test_swapped_columns_of_the_dots(good: Survey) -> None:
         assert f"{len(dots)} of {len(dots)} images" in only(tuple(findings)).message
 
 
-def test_a_moved_tape_is_told_with_its_size(good: Survey) -> None:
+def test_a_moved_tape_is_reported_with_its_size(good: Survey) -> None:
     design = good.board.tapes_in_board_m
     there = {p.point: p.position_m for p in good.station if p.placement == "mast-2"}
     along = (there["b"] - there["a"]) / np.linalg.norm(design["b"] - design["a"])
@@ -293,13 +293,13 @@ def test_exchanged_tapes_are_named(good: Survey, names: tuple[str, str]) -> None
 def test_two_boards_mixed_up(good: Survey, rig: Rig) -> None:
     findings = check_survey(with_swapped_boards(good, "level", "mast-1", "mast-8"))
     mixed = {i.name for i in good.images if i.placement in ("mast-1", "mast-8")}
-    told = {f.place.split("image ")[1] for f in findings}
-    assert told == mixed
+    named = {f.place.split("image ")[1] for f in findings}
+    assert named == mixed
     assert all(f.severity == "warning" and "Two boards may be mixed up" in f.advice for f in findings)
     findings = check_survey(with_swapped_boards(good, "level", "pancam-5m-1", "pancam-10m-3"))
     mixed = {i.name for i in good.images if i.placement in ("pancam-5m-1", "pancam-10m-3")}
-    told = {f.place.split("image ")[1] for f in findings}
-    assert told == mixed
+    named = {f.place.split("image ")[1] for f in findings}
+    assert named == mixed
     assert "times" in findings[0].message
 
 
@@ -321,8 +321,8 @@ def test_placements_of_a_camera_that_slipped_by_rows_are_one_error(
             else None
         ),
     )
-    told = [f for f in check_survey(changed) if "cannot show" in f.message]
-    finding = only(tuple(told))
+    named = [f for f in check_survey(changed) if "cannot show" in f.message]
+    finding = only(tuple(named))
     assert finding.severity == "error" and finding.place == "camera navcam_left"
     assert f"of {len(mine)} images cannot show the board they name, e.g. {mine[0].name}" in finding.message
 
@@ -338,7 +338,7 @@ def with_joints(survey: Survey, read: Callable[[float, float], tuple[float, floa
 
 
 @pytest.mark.parametrize(
-    ("read", "words"),
+    ("read", "phrase"),
     [
         (lambda p, t: (-p, t), "the sign of pan_rad is wrong:"),
         (lambda p, t: (p, -t), "the sign of tilt_rad is wrong:"),
@@ -348,11 +348,11 @@ def with_joints(survey: Survey, read: Callable[[float, float], tuple[float, floa
     ],
 )
 def test_joints_that_count_the_other_way(
-    good: Survey, read: Callable[[float, float], tuple[float, float]], words: str
+    good: Survey, read: Callable[[float, float], tuple[float, float]], phrase: str
 ) -> None:
     finding = only(check_survey(with_joints(good, read)))
     assert finding.severity == "error"
-    assert finding.message.startswith(words)
+    assert finding.message.startswith(phrase)
 
 
 def test_a_board_larger_than_any_image_shows(good: Survey) -> None:

@@ -83,11 +83,11 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_what_is_no_board_is_refused_with_its_key(tmp_path: Path, case: str) -> None:
-    old, new, told = CASES[case]
+    old, new, expected = CASES[case]
     assert old in TEXT
     path = tmp_path / "board.yaml"
     path.write_text(TEXT.replace(old, new))
     with pytest.raises(BadFile) as error:
         load_board(path)
-    assert told in str(error.value)
+    assert expected in str(error.value)
     assert "\n" not in str(error.value)

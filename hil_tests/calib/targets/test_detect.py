@@ -160,7 +160,7 @@ def test_without_a_prediction_an_aslant_board_is_not_sure() -> None:
 
 
 @pytest.mark.parametrize("roll_deg", [45, 90, 135, 200])
-def test_an_upright_camera_tells_the_order_of_a_rolled_board(roll_deg: float) -> None:
+def test_an_upright_camera_gives_the_order_of_a_rolled_board(roll_deg: float) -> None:
     rng = np.random.default_rng(17)
     shot = shoot(rng, SIDE, pose(4.0, (25, 120), roll_deg, (0.3, 0.1)))
     down_in_board = shot.camera_from_board.rotation.T @ np.array([0.1, 1.0, 0.2])
@@ -226,8 +226,8 @@ def test_hidden_dots_are_left_out() -> None:
 def test_a_board_cut_by_the_image_says_by_which_edge() -> None:
     rng = np.random.default_rng(21)
     shot = shoot(rng, SIDE, pose(4.0, aside_m=(0.9, 0.0)))
-    told = reason(find_dots(shot.image, BOARD, PredictedBoard(shot.camera, shot.camera_from_board)))
-    assert "right edge" in told and "10 x 10 are expected" in told
+    answer = reason(find_dots(shot.image, BOARD, PredictedBoard(shot.camera, shot.camera_from_board)))
+    assert "right edge" in answer and "10 x 10 are expected" in answer
 
 
 @pytest.mark.parametrize("roll_deg", [0, 90])
@@ -269,8 +269,8 @@ def test_two_boards_are_not_chosen_between() -> None:
 
 def test_a_board_seen_from_behind_by_the_survey_is_said() -> None:
     turned = Rigid(Rotation.from_rotvec([0, np.radians(170), 0]).as_matrix(), np.array([0, 0, 4.0]))
-    told = reason(find_dots(np.zeros((480, 640), dtype=np.uint8), BOARD, PredictedBoard(SIDE, turned)))
-    assert "back of the board" in told
+    answer = reason(find_dots(np.zeros((480, 640), dtype=np.uint8), BOARD, PredictedBoard(SIDE, turned)))
+    assert "back of the board" in answer
 
 
 def test_images_of_another_kind_are_refused() -> None:
@@ -298,7 +298,7 @@ def test_a_board_with_a_quarter_of_its_dots_covered_is_refused() -> None:
     assert "10 x 10 are expected" in reason(find_dots(image, BOARD, shot.roughly(rng)))
 
 
-def test_a_spot_is_told_by_the_ellipse_that_was_drawn() -> None:
+def test_a_spot_is_measured_as_the_ellipse_that_was_drawn() -> None:
     """An ellipse of 8 by 5 px at 0.4 rad, drawn by its share of each pixel's 16 by 16 points."""
     x, y = np.meshgrid(np.arange(0.0, 64.0, 1 / 16) - 15 / 32, np.arange(0.0, 48.0, 1 / 16) - 15 / 32)
     turn = np.array([[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]])

@@ -145,7 +145,7 @@ def test_each_side_of_a_picture_is_as_good_as_the_other(
 
 @pytest.mark.parametrize(("astray_px", "kept"), [(0.6, True), (1.0, False)])
 def test_a_corner_is_left_out_by_how_far_off_the_others_are(astray_px: float, kept: bool) -> None:
-    """Each corner of a print is 0.1 px off, far beyond what its picture tells, in no pattern."""
+    """Each corner of a print is 0.1 px off, far beyond what its picture shows, in no pattern."""
     image = drawn((CHARUCO, (0.1, 0.1, 0.0), (0.0, 0.0, 0.7)))
     true = corners_of(CHARUCO, image)
     shift = np.random.default_rng(8).normal(0.0, 0.1, (len(true), 2))
@@ -254,12 +254,12 @@ def test_kalibrs_own_tags_are_upright() -> None:
 @pytest.mark.parametrize("turns", [0, 1, 2])
 def test_an_aprilgrid_of_opencvs_tags_gets_its_cause(from_top: bool, turns: int) -> None:
     """OpenCV's dictionary holds each tag half a turn off Kalibr's; its GridBoard counts from the top."""
-    words = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     image = np.full((5 * 78 + 60, 6 * 78 + 60), 255, np.uint8)
     for k in range(30):
         row, column = divmod(k, 6)
         top, left = 39 + (row if from_top else 4 - row) * 78, 39 + column * 78
-        tag = cv2.aruco.generateImageMarker(words, k, 60, borderBits=2)
+        tag = cv2.aruco.generateImageMarker(dictionary, k, 60, borderBits=2)
         image[top : top + 60, left : left + 60] = tag
     picture = np.ascontiguousarray(np.rot90(cv2.GaussianBlur(image, (0, 0), 0.8), turns))
     reason = why_not(APRILGRID, picture)
