@@ -40,7 +40,7 @@ GOOD_PX = 0.005
 _COEFFICIENT_PX = 1e-3
 """What a coefficient of 1 costs in a fit: nothing, except where the pixels do not tell it."""
 
-_STEPS, _BIT, _NO_STEP_PX = 100, 1e-6, 1e-9
+_STEPS, _BIT, _NO_STEP_PX = 400, 1e-6, 1e-9
 """How many cameras a fit may try; a step of numeric derivatives; a start this near is the answer."""
 
 _LOST_PX = 1e3
@@ -336,7 +336,7 @@ def _fit(
 
     if np.abs(off(begin)[: pixels.size]).max() < _NO_STEP_PX:
         return start
-    return camera_of(least_squares(off, begin, rates, method="lm", x_scale="jac", max_nfev=_STEPS).x)
+    return camera_of(least_squares(off, begin, rates, method="lm", x_scale=1.0, max_nfev=_STEPS).x)
 
 
 def _points_of(camera: CameraModel) -> tuple[FloatArray, FloatArray]:
