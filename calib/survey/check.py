@@ -33,24 +33,17 @@ AREA = 0.6
 
 PAN_RANGE_RAD, TILT_RANGE_RAD, STILL_RAD = 0.5, 0.2, 0.02
 
-PAN_LIMITS_RAD = (-np.pi, np.pi)
-TILT_LIMITS_RAD = (-np.pi / 2, np.pi / 2)
+MOST_RAD = {"pan": np.pi, "tilt": np.pi / 2}
 
 
-def check_survey(
-    survey: Survey,
-    pan_limits_rad: tuple[float, float] = PAN_LIMITS_RAD,
-    tilt_limits_rad: tuple[float, float] = TILT_LIMITS_RAD,
-    *,
-    only_camera_images: bool = False,
-) -> tuple[SurveyFinding, ...]:
+def check_survey(survey: Survey, *, only_camera_images: bool = False) -> tuple[SurveyFinding, ...]:
     """Return what is missing, too little, or at odds with itself in a survey; errors first.
 
-    Pictures are looked for in the survey's folder. Joint angles beyond the limits are refused. With
-    ``only_camera_images`` cameras will be fitted to images of purpose camera alone, as the paper does.
+    Pictures are looked for in the survey's folder. With ``only_camera_images`` cameras will be fitted to
+    images of purpose camera alone, as the paper does.
     """
     purposes = ("camera",) if only_camera_images else ("camera", "mast")
-    angles = list(_angles(survey, pan_limits_rad, tilt_limits_rad))
+    angles = list(_angles(survey))
     findings = [*_of_cameras(survey), *angles]
     if survey.boards:
         findings += _bench_placements(survey)
@@ -194,17 +187,15 @@ def _placements(survey: Survey) -> Iterator[SurveyFinding]:
             )
 
 
-def _angles(
-    survey: Survey, pan_limits_rad: tuple[float, float], tilt_limits_rad: tuple[float, float]
-) -> Iterator[SurveyFinding]:
-    """Joint angles outside their limits; many of them are degrees."""
-    for joint, (low, high) in (("pan", pan_limits_rad), ("tilt", tilt_limits_rad)):
+def _angles(survey: Survey) -> Iterator[SurveyFinding]:
+    """Joint angles that no head has; many of them are degrees."""
+    for joint, most in MOST_RAD.items():
         angles = [(getattr(i, f"{joint}_rad"), i) for i in survey.images if i.pan_rad is not None]
-        off = [(angle, image) for angle, image in angles if not low <= angle <= high]
+        off = [(angle, image) for angle, image in angles if not abs(angle) <= most]
         if not off:
             continue
         worst, image = max(off, key=lambda entry: abs(entry[0]))
-        advice = "Correct the angle, or the limits if the mast goes there"
+        advice = "Correct the angle"
         if abs(worst) > np.pi:
             advice = (
                 f"If the angles are in degrees, write radians: {worst:g} degrees are "
@@ -213,7 +204,7 @@ def _angles(
         yield SurveyFinding(
             "error",
             f"images.csv line {image.row}, {joint}_rad",
-            f"{joint} of {len(off)} of {len(angles)} images is outside {low:.2f} to {high:.2f} rad, "
+            f"{joint} of {len(off)} of {len(angles)} images is outside {-most:.2f} to {most:.2f} rad, "
             f"the furthest {worst:g} (image {image.name})",
             advice,
         )

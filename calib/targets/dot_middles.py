@@ -50,14 +50,13 @@ class DotCentres(NamedTuple):
     """Fitted dots, not-a-number where the fit found none.
 
     middles_px (n, 2); sigma_px (n,) per axis, from the noise that the fit left; sizes (n,) fitted over given
-    radius; contrast_dn (n,); noise_dn (n,) rms of the fit's residuals.
+    radius; contrast_dn (n,).
     """
 
     middles_px: FloatArray
     sigma_px: FloatArray
     sizes: FloatArray
     contrast_dn: FloatArray
-    noise_dn: FloatArray
 
 
 def fit_ellipses(image: Levels, middles_px: FloatArray, shapes_px: FloatArray) -> DotCentres:
@@ -102,7 +101,7 @@ def fit_ellipses(image: Levels, middles_px: FloatArray, shapes_px: FloatArray) -
     good = (freedom > 0) & ~open_ & (np.linalg.norm(state[:, :2], axis=1) < farthest)
     good &= (state[:, 7] > 0.0) & (state[:, 2] > 0.5) & (state[:, 2] < 2.0)
     out = [middles_px + state[:, :2], sigma]
-    out += [state[:, 2], state[:, 4] * state[:, 7], noise]
+    out += [state[:, 2], state[:, 4] * state[:, 7]]
     for values in out:
         values[~good] = np.nan
     return DotCentres(*out)
@@ -126,6 +125,23 @@ def centred(image: Grey8, middles_px: FloatArray, shapes_px: FloatArray) -> Floa
     return np.asarray(middles)
 
 
+def windows(
+    image: Levels, middles_px: FloatArray, half_px: int, stride: int = 1
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Return u (n, p, 2), pixels from the middles; grey levels (n, p); which pixels are in the image (n, p).
+
+    A pixel outside has the level of the nearest one inside.
+    """
+    offsets = np.arange(-half_px, half_px + 1, stride)
+    dx, dy = (part.ravel() for part in np.meshgrid(offsets, offsets))
+    whole = np.rint(middles_px).astype(np.int64)
+    columns, rows = whole[:, :1] + dx, whole[:, 1:] + dy
+    height, width = image.shape
+    inside = (columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)
+    levels = image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)].astype(np.float64)
+    return np.stack([columns - middles_px[:, :1], rows - middles_px[:, 1:]], axis=-1), levels, inside
+
+
 def _patches(
     image: Levels, middles_px: FloatArray, shapes_px: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -134,14 +150,7 @@ def _patches(
     reach = np.minimum(REACH, 1.0 + BLURS / lengths[:, 1])
     half = int(np.ceil((reach * lengths[:, 0]).max()))
     stride = max(1, -(-(2 * half + 1) // MOST_POINTS_ACROSS))
-    offsets = np.arange(-half, half + 1, stride)
-    dx, dy = (a.ravel() for a in np.meshgrid(offsets, offsets))
-    whole = np.rint(middles_px).astype(int)
-    columns, rows = whole[:, :1] + dx, whole[:, 1:] + dy
-    height, width = image.shape
-    inside = (columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)
-    levels = image[np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)].astype(np.float64)
-    u = np.stack([columns - middles_px[:, :1], rows - middles_px[:, 1:]], axis=-1)
+    u, levels, inside = windows(image, middles_px, half, stride)
     q = np.linalg.norm(u @ np.linalg.inv(shapes_px).transpose(0, 2, 1), axis=-1)
     return u, levels, (inside & (q < reach[:, None])).astype(np.float64)
 

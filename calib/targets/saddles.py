@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from calib.geometry.rigid import FloatArray, IntArray
+from calib.geometry.rigid import FloatArray
 from calib.targets.boards import Levels
-from calib.targets.dot_middles import diagonals
+from calib.targets.dot_middles import diagonals, windows
 from calib.targets.pattern import Cells
 
 PARAMETERS = 11
@@ -204,33 +204,19 @@ def pixels_about(
     ``pixels_px`` (n, 2) are the windows' middles to a fraction of a pixel, ``jacobians`` (n, 2, 2) px/m,
     ``wide_px`` (n,) the standard deviation of what blurs an edge there.
     """
-    columns, rows, inside = _window(image, pixels_px)
-    levels = image[rows, columns].astype(np.float64)
-    u = np.stack([columns - pixels_px[:, :1], rows - pixels_px[:, 1:]], axis=-1)
+    u, levels, inside = windows(image, pixels_px, HALF_PX)
     alone = _alone(crossings, np.rint(pixels_px) - pixels_px, jacobians, wide_px)
     return Pixels(u, levels, (inside & alone).astype(np.float64))
 
 
 def sharpness_px(image: Levels, pixels_px: FloatArray) -> FloatArray:
     """Return about the standard deviation (n,) of what blurs edges in windows, by their steepest slopes."""
-    columns, rows, _ = _window(image, pixels_px)
     side = 2 * HALF_PX + 1
-    levels = image[rows, columns].astype(np.float64).reshape(-1, side, side)
+    levels = windows(image, pixels_px, HALF_PX)[1].reshape(-1, side, side)
     dark, bright = np.percentile(levels, (5.0, 95.0), axis=(1, 2))
     slopes = np.hypot(levels[:, 1:-1, 2:] - levels[:, 1:-1, :-2], levels[:, 2:, 1:-1] - levels[:, :-2, 1:-1])
     steep = np.percentile(slopes, STEEP, axis=(1, 2)) / 2.0
     return np.asarray((bright - dark) / np.sqrt(2 * np.pi) / np.maximum(steep, 1e-3))
-
-
-def _window(image: Levels, pixels_px: FloatArray) -> tuple[IntArray, IntArray, NDArray[np.bool_]]:
-    """Columns and rows (n, p) of windows, those outside the image moved into it, and which are inside."""
-    offsets = np.arange(-HALF_PX, HALF_PX + 1)
-    dx, dy = (part.ravel() for part in np.meshgrid(offsets, offsets))
-    whole = np.rint(pixels_px).astype(np.int64)
-    columns, rows = whole[:, :1] + dx, whole[:, 1:] + dy
-    height, width = image.shape
-    inside = (columns >= 0) & (rows >= 0) & (columns < width) & (rows < height)
-    return np.clip(columns, 0, width - 1), np.clip(rows, 0, height - 1), inside
 
 
 def _alone(

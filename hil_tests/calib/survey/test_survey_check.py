@@ -201,8 +201,9 @@ def test_angles_in_degrees(good: Survey) -> None:
 
 
 def test_an_angle_outside_the_limits(good: Survey) -> None:
-    findings = check_survey(good, tilt_limits_rad=(-0.6, 0.6))
-    assert "outside -0.60 to 0.60 rad" in only(findings).message
+    first = next(i for i in good.images if i.tilt_rad is not None)
+    changed = with_images(good, lambda i: replace(i, tilt_rad=1.6) if i is first else i)
+    assert "outside -1.57 to 1.57 rad" in only(check_survey(changed)).message
 
 
 @pytest.mark.parametrize(
