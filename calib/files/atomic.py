@@ -1,10 +1,10 @@
 """Saving a file so that a crash at any moment leaves the old content or the new, never less.
 
-`save_bytes` writes the new content beside the file and fsyncs it. It gives the old content a second name,
-renames the new one into place, fsyncs the folder, and renames the old one to ``NAME.previous.SUFFIX``. After
-a crash in between the folder may hold a hidden ``.NAME.*.new`` or ``.NAME.*.old`` beside the file; neither is
-ever read. `replace_bytes` is the same without a second name, for a program's own files. `overwrite_bytes`
-writes in place, for callers that cannot wait.
+`save_bytes` writes the new content and a copy of the old one beside the file and fsyncs them. It renames the
+new one into place, fsyncs the folder, and renames the copy to ``NAME.previous.SUFFIX``. After a crash in
+between the folder may hold a hidden ``.NAME.*.new`` or ``.NAME.*.old`` beside the file; neither is ever read.
+`replace_bytes` is the same without a copy, for a program's own files. `overwrite_bytes` writes in place, for
+callers that cannot wait.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import contextlib
 import errno
 import os
 import secrets
-import shutil
 import stat
 from itertools import count
 from pathlib import Path
@@ -39,7 +38,7 @@ def keep_previous(path: str | Path) -> Path | None:
         for number in count(1):
             kept = previous.with_name(f"{previous.stem}-{number}{previous.suffix}")
             with contextlib.suppress(FileExistsError):
-                _second_name(previous, kept)
+                _copy(previous, kept)
                 return kept
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
@@ -61,9 +60,9 @@ def save_bytes(path: str | Path, data: bytes) -> None:
         old = target.with_name(f".{target.name}.{mark}.old")
         placed = False
         try:
-            _write(new, data, mode)
+            write_new(new, data, mode)
             if mode is not None:
-                _second_name(target, old)
+                _copy(target, old)
             new.replace(target)
             placed = True
             sync_folder(target.parent)
@@ -95,7 +94,7 @@ def replace_bytes(path: Path, data: bytes, mode: int = 0o600) -> None:
     new = path.with_name(f".{path.name}.new")
     try:
         new.unlink(missing_ok=True)
-        _write(new, data, mode)
+        write_new(new, data, mode)
         new.replace(path)
     except OSError:
         with contextlib.suppress(OSError):
@@ -140,7 +139,8 @@ def _mode_of(target: Path) -> int | None:
     return stat.S_IMODE(found.st_mode)
 
 
-def _write(new: Path, data: bytes, mode: int | None) -> None:
+def write_new(new: Path, data: bytes, mode: int | None = None) -> None:
+    """Write a file that must not exist; when this returns its content is on the disk. Raises OSError."""
     descriptor = os.open(new, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
     try:
         if mode is not None:
@@ -157,21 +157,9 @@ def _write_all(descriptor: int, data: bytes) -> None:
         left = left[os.write(descriptor, left) :]
 
 
-def _second_name(target: Path, old: Path) -> None:
-    """Give the file a second name; file systems without hard links get a copy."""
-    try:
-        os.link(target, old)
-    except FileExistsError:
-        raise
-    except OSError:
-        if old.exists():
-            raise FileExistsError(errno.EEXIST, "is there already", str(old)) from None
-        shutil.copy2(target, old)
-        descriptor = os.open(old, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+def _copy(path: Path, copy: Path) -> None:
+    """Write a file's content under a second name, which must be free."""
+    write_new(copy, path.read_bytes(), stat.S_IMODE(path.stat().st_mode))
 
 
 def sync_folder(folder: Path) -> None:

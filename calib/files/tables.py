@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TextIO
 
@@ -79,11 +79,18 @@ def csv_rows(text: str, path: str | Path) -> Iterator[tuple[int, list[str]]]:
 
 def write_table(stream: TextIO, columns: Sequence[str], values: FloatArray) -> None:
     """Write (rows, columns) numbers as CSV; a row with a number that is not finite becomes empty cells."""
-    stream.write(",".join(columns) + "\n")
-    empty = "," * (len(columns) - 1) + "\n"
-    finite = np.logical_and.reduce(np.isfinite(values), axis=1)
-    rows = zip(values.tolist(), finite.tolist(), strict=True)
-    stream.writelines(",".join(map(repr, row)) + "\n" if good else empty for row, good in rows)
+    finite = np.isfinite(values).all(axis=1).tolist()
+    empty = [""] * len(columns)
+    write_rows(
+        stream, columns, (row if good else empty for row, good in zip(values.tolist(), finite, strict=True))
+    )
+
+
+def write_rows(stream: TextIO, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Write a header and rows as CSV: numbers in shortest round-trip form, None as an empty cell."""
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(rows)
 
 
 def check_header(

@@ -6,9 +6,7 @@ A bench's folder is written at once too, or picture by picture while it is measu
 from __future__ import annotations
 
 import contextlib
-import csv
 import io
-import os
 import secrets
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -17,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from calib.errors import BadFile
-from calib.files.atomic import replace_bytes, sync_folder
+from calib.files.atomic import replace_bytes, sync_folder, write_new
 from calib.files.mast_file import sensor_mode_keys
+from calib.files.tables import write_rows
 from calib.files.yaml_text import dump_mapping, plain
 from calib.survey.reader import (
     APPROACH_COLUMNS,
@@ -163,9 +162,9 @@ def write_survey(survey: Survey, folder: str | Path, pictures: Iterable[tuple[st
         raise BadFile(folder, "", f"cannot be written: {error}") from None
     try:
         for name, data in _files(survey).items():
-            _write(new / name, data)
+            write_new(new / name, data)
         for name, data in pictures:
-            _write(_picture_path(new, Path(name), folder), data)
+            write_new(_picture_path(new, Path(name), folder), data)
         try:
             read_survey(new)
         except BadFile as error:  # which names the file as it would have been called
@@ -188,13 +187,6 @@ def _picture_path(folder: Path, file: Path, named: str | Path) -> Path:
         raise BadFile(named, str(file), "the picture lies outside the folder")
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
-
-
-def _write(path: Path, data: bytes) -> None:
-    with path.open("xb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def _files(survey: Survey) -> dict[str, bytes]:
@@ -266,9 +258,6 @@ def _corners_table(images: Iterable[SurveyImage], corners: Mapping[str, Corners]
 
 
 def _table(columns: Sequence[str], rows: Iterable[Sequence[object]]) -> bytes:
-    """Return a CSV file's bytes: numbers in shortest round-trip form, None as an empty cell."""
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(rows)
+    write_rows(text, columns, rows)
     return text.getvalue().encode()

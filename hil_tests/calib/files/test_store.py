@@ -430,7 +430,7 @@ class _Trip:
 
     def __init__(self, patch: pytest.MonkeyPatch, at: int, action: Callable[[], None]) -> None:
         self.count = 0
-        for holder, name in ((os, "open"), (os, "fsync"), (os, "link"), (Path, "replace")):
+        for holder, name in ((os, "open"), (os, "fsync"), (Path, "replace")):
             patch.setattr(holder, name, self._wrap(getattr(holder, name), at, action))
 
     def _wrap(self, function: Callable[..., Any], at: int, action: Callable[[], None]) -> Callable[..., Any]:
@@ -480,7 +480,6 @@ def test_an_error_at_any_step_of_a_save_leaves_the_folder_as_it_was(tmp_path: Pa
         raise OSError(28, "No space left on device")
 
     calls = _calls_of_a_save(tmp_path)
-    refused = 0
     for at in range(1, calls + 1):
         folder = tmp_path / f"error{at}"
         folder.mkdir()
@@ -489,16 +488,10 @@ def test_an_error_at_any_step_of_a_save_leaves_the_folder_as_it_was(tmp_path: Pa
         save_bytes(path, b"old")
         with pytest.MonkeyPatch.context() as patch:
             _Trip(patch, at, fail)
-            try:
+            with pytest.raises(BadFile, match="No space left on device"):
                 save_bytes(path, b"new")
-            except BadFile as error:
-                refused += 1
-                assert "No space left on device" in str(error)
-                expected = {"rig.yaml": b"old", "rig.previous.yaml": b"older"}
-            else:  # no hard links on this file system: a copy serves
-                expected = {"rig.yaml": b"new", "rig.previous.yaml": b"old"}
+        expected = {"rig.yaml": b"old", "rig.previous.yaml": b"older"}
         assert {file.name: file.read_bytes() for file in folder.iterdir()} == expected, f"error at call {at}"
-    assert refused == calls - 1
 
 
 def test_joints_are_read_as_the_contract_writes_them_and_written_the_same(tmp_path: Path) -> None:
