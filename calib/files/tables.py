@@ -79,7 +79,7 @@ def csv_rows(text: str, path: str | Path) -> Iterator[tuple[int, list[str]]]:
 
 def write_table(stream: TextIO, columns: Sequence[str], values: FloatArray) -> None:
     """Write (rows, columns) numbers as CSV; a row with a number that is not finite becomes empty cells."""
-    finite = np.isfinite(values).all(axis=1).tolist()
+    finite = np.logical_and.reduce(np.isfinite(values), axis=1).tolist()
     empty = [""] * len(columns)
     write_rows(
         stream, columns, (row if good else empty for row, good in zip(values.tolist(), finite, strict=True))
