@@ -34,7 +34,7 @@ UNKNOWN_FRAME = "unknown"
 
 _LINE = re.compile(r"\s*([A-Za-z]\w*(?: internal)?)\s*=\s*(.*?)\s*")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
-_MODEL = re.compile(r"(CAHVORE|CAHVOR|CAHV)\s*(\d*)\s*(?:,\s*([^\s=]+))?\s*(?:=.*)?")
+_MODEL = re.compile(r"(?:(CAHVORE)\s*([123])\s*(?:,\s*([^\s=]+))?|(CAHVOR|CAHV))\s*(?:=.*)?")
 _SCALARS = ("Hs", "Hc", "Vs", "Vc", "Theta")
 _MODEL_NAMES = {"CAHV": "perspective, linear", "CAHVOR": "perspective, distortion"}
 _CAHVORE_NAMES = {1: "perspective, distortion, pupil", 2: "fish-eye", 3: "general"}
@@ -206,22 +206,16 @@ def _kind(values: Values, path: str | Path) -> tuple[Kind, int, float | None]:
         return ("CAHVOR" if "R" in values else "CAHV"), 0, None
     value, line = values["Model"]
     match = _MODEL.fullmatch(value)
-    expected = "CAHV, CAHVOR, CAHVORE1, CAHVORE2 or CAHVORE3,linearity"
-    if match is None:
+    if match is None or (match[2] == "3" and match[3] is None):
+        expected = "CAHV, CAHVOR, CAHVORE1, CAHVORE2 or CAHVORE3,linearity"
         raise BadFile(path, f"line {line}", f"Model '{value[:40]}' where {expected} is expected")
-    kind, cahvore_type, linearity = match.groups()
-    if kind != "CAHVORE":
-        if cahvore_type or linearity:
-            raise BadFile(path, f"line {line}", f"Model '{value[:40]}' where {expected} is expected")
-        return cast(Kind, kind), 0, None
-    if cahvore_type not in ("1", "2", "3") or (cahvore_type == "3" and linearity is None):
-        raise BadFile(path, f"line {line}", f"Model '{value[:40]}' where {expected} is expected")
-    number = None if linearity is None else _number(linearity, path, line)
+    if match[4]:
+        return cast(Kind, match[4]), 0, None
+    number = None if match[3] is None else _number(match[3], path, line)
     if number is not None and abs(number) > 100:
-        raise BadFile(
-            path, f"line {line}", f"linearity {number:g} where a number from -100 to 100 is expected"
-        )
-    return "CAHVORE", int(cahvore_type), number
+        reason = f"linearity {number:g} where a number from -100 to 100 is expected"
+        raise BadFile(path, f"line {line}", reason)
+    return "CAHVORE", int(match[2]), number
 
 
 def _number(text: str, path: str | Path, line: int) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.files import open_plain
 from calib.files.pictures import decode_picture
-from calib.geometry.cahvor import WIDE, CameraModel
+from calib.geometry.cahvor import COEFFICIENTS, WIDE, CameraModel, Kind
 from calib.geometry.rigid import FloatArray, Rigid, rot_y, rot_z
 from calib.survey.alignment import NotAligned, rover_from_station, station_from_board
 from calib.survey.records import Survey, SurveyCamera, SurveyImage
@@ -161,20 +161,14 @@ def _rough_model(
 ) -> CameraModel:
     """An ideal camera there: its rows are level in its carrier, its lens a pinhole or an even fisheye."""
     A = turned @ first_A
+    A = A / np.linalg.norm(A)
     right = np.cross(turn @ DOWN, A)
     if float(np.linalg.norm(right)) < 1e-3:  # straight down: the top of the image is ahead
         right = turn @ np.array([0.0, 1.0, 0.0])
-    right = right / np.linalg.norm(right)
     right = right - (right @ A) * A
     right = right / np.linalg.norm(right)
     x_px, y_px = ((n - 1) / 2 for n in camera.size_px)
-    wide = camera.kind in WIDE
-    return CameraModel(
-        "CAHVORE" if wide else "CAHV",
-        camera.size_px,
-        C,
-        A / np.linalg.norm(A),
-        camera.focal_px * right + x_px * A,
-        camera.focal_px * np.cross(A, right) + y_px * A,
-        cahvore_type=2 if wide else 0,
-    )
+    matrix = [[camera.focal_px, 0.0, x_px], [0.0, camera.focal_px, y_px], [0.0, 0.0, 1.0]]
+    kind: Kind = "OPENCV_FISHEYE" if camera.kind in WIDE else "CAHV"
+    lens = np.zeros(COEFFICIENTS.get(kind, 0))
+    return CameraModel.of_matrix(kind, camera.size_px, matrix, lens, [right, np.cross(A, right), A], C)
