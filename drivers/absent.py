@@ -74,7 +74,7 @@ def stop_at_last(stop: Callable[[], object], clock: Clock, device: str) -> None:
             if clock.now_s() < until_s:
                 clock.sleep(FIRST_WAIT_S)
                 continue
-            words = "the last stop was not confirmed, the head may still move; 'mastctl halt' stops it"
+            words = "the last stop was not confirmed; 'mastctl stop --without-daemon' stops the head"
             log.warning("%s: %s: %s", device, words, error)
         return
 

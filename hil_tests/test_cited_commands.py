@@ -76,7 +76,7 @@ def options_of(module: str) -> frozenset[str]:
     texts = [file.read_text(encoding="utf-8"), (REPOSITORY / "tools/command.py").read_text(encoding="utf-8")]
     texts.append((REPOSITORY / "mastctl/cli/tasks.py").read_text(encoding="utf-8"))
     texts += [one.read_text(encoding="utf-8") for one in file.parent.glob("*.py")]
-    return frozenset(re.findall(r'"(--[a-z][\w-]*)"', "\n".join(texts)))
+    return frozenset(re.findall(r'"(--[a-z][\w-]*)[" ]', "\n".join(texts)))
 
 
 def test_every_cited_tool_has_the_options_that_are_shown() -> None:

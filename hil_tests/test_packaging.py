@@ -194,7 +194,7 @@ def test_the_installed_command_points_a_small_rover_and_checks_it(
 ) -> None:
     mastctl, how = installed.program("mastctl"), {"env": installed.environ, "cwd": tmp_path}
     assert "usage: mastctl" in run(mastctl, "--help", timeout_s=TIMEOUT_S, **how).stdout
-    rig = ("sim", "new", "rig", "--size", "320x240", "--view-deg", "40", "--speed", "max")
+    rig = ("rig", "sim", "new", "rig", "--size", "320x240", "--view-deg", "40", "--speed", "max")
     run(mastctl, *rig, timeout_s=TIMEOUT_S, **how)
     config = tmp_path / "rig" / "config.yaml"
     config.write_text(config.read_text().replace("port: 8420", "port: 0"))

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from tools.campaigns import provocations
 from tools.command import end
 
 CASES = {
@@ -54,12 +53,3 @@ def test_the_help_of_the_demo_names_the_operator_page(repository: Path, tmp_path
     for option in ("--help", "-h"):
         said = subprocess.run([demo, option], capture_output=True, text=True, check=True).stdout
         assert "--page" in said and f"mastctl demo {option}" in said
-
-
-def test_listing_a_tools_tasks_runs_none(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        provocations.main(["bench", "--only", "ids", "--list-tasks"])
-    assert [row.split("  ")[1:] for row in capsys.readouterr().out.splitlines()] == [
-        ["to do", "other ids"],
-        ["to do", "two boards of the same ids"],
-    ]

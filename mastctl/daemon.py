@@ -68,7 +68,7 @@ class AddressInUse(MastctlError):
 
 def run(
     config: Config,
-    on_ready: Callable[[str], None],
+    on_ready: Callable[[str], object],
     clock: Clock | None = None,
     *,
     draws_ahead: bool = False,

@@ -21,8 +21,9 @@ from numpy.typing import ArrayLike
 from calib.errors import CalibError
 from drivers.errors import DriverError
 from mastctl import signals
-from mastctl.cli.output import CommandError, WrongUse, as_command_error, at_least, one_line
-from mastctl.cli.tasks import add_task_options, results_of
+from mastctl.cli.options import add_options, at_least
+from mastctl.cli.output import CommandError, WrongUse, as_command_error, one_line
+from mastctl.cli.tasks import TASKS
 from mastctl.errors import MastctlError
 
 Task = TypeVar("Task")
@@ -77,26 +78,8 @@ def options(
     if as_json:
         parser.add_argument("--json", action="store_true", help="one JSON document")
     if tasks:
-        add_task_options(parser)
+        add_options(parser, TASKS)
     return parser
-
-
-def run_cases(
-    args: argparse.Namespace,
-    what: str,
-    function: Callable[[Task], Result],
-    tasks: Sequence[Task],
-    label: Callable[[Task], str] = str,
-    **told: Callable[[Result], Any],
-) -> list[Result]:
-    """Return the results of tasks in their order, as `mastctl.cli.tasks.results_of` runs and tells them.
-
-    Where tasks are only listed, or some of them run, the command ends here.
-    """
-    found = results_of(args, what, function, tasks, label, **told)
-    if found is None:
-        raise SystemExit(0)
-    return found
 
 
 def show(args: argparse.Namespace, rows: Iterable[Row], columns: Mapping[str, str], below: str = "") -> None:

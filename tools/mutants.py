@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mastctl.cli.output import at_least
+from mastctl.cli.options import at_least
 from tools.command import end, options
 
 REPOSITORY = Path(__file__).resolve().parent.parent

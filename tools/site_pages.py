@@ -102,7 +102,7 @@ def commands_page() -> str:
     """Return every command with its options, as `--help` has them."""
     lines = ["# Commands", ""]
     lines += ["Written from the parsers, so that it agrees with `mastctl COMMAND --help`.", ""]
-    for depth, parser in _parsers(build_parser([]), 1):
+    for depth, parser in _parsers(build_parser(), 1):
         lines += [f"{'#' * min(depth, 4)} `{parser.prog}`", ""] if depth > 1 else []
         lines += [_plain(parser.description or ""), ""]
         lines += ["```text", _usage(parser), "```", ""]

@@ -190,7 +190,7 @@ def what_is_needed(number: int) -> str:
             f"the model number {number}, nor do the tables of the installed dynamixel-sdk: needed is a "
             "dynamixel-sdk that holds its .model table"
         )
-    words = f"the {theirs} (model number {number}); mastctl servo info reads it"
+    words = f"the {theirs} (model number {number}); mastctl rig servo info reads it"
     if theirs.startswith("ym"):
         return f"{words}. It needs registers laid out as those of X or P, which the Y family's are not"
     return f"{words}. Needed is a row in drivers/dynamixel/models.py: its unit of current and its backlash"

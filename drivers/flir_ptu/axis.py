@@ -35,11 +35,11 @@ REST_S = 0.2
 BRAKING_S = 0.5  # an axis that was under way when it was seen last may have gone on for so long
 HIT = (
     "the {axis} axis ran into its limit switch, so the unit has lost count of its position; "
-    "home it (mastctl ptu home)"
+    "home it (mastctl rig ptu home)"
 )
 JUMPED = (
     "{axis} was at {before:.4f} rad before the connection was lost and is at {after:.4f} rad now, "
-    "so the unit may have lost count; home it (mastctl ptu home)"
+    "so the unit may have lost count; home it (mastctl rig ptu home)"
 )
 
 
@@ -81,7 +81,7 @@ class StepAxis:
         if not resolution_arcsec > 0:
             raise WrongDevice(
                 f"says that a {name} position is {resolution_arcsec:g} seconds of arc; "
-                "home it (mastctl ptu home), it does not know before",
+                "home it (mastctl rig ptu home), it does not know before",
                 device=DEVICE,
             )
         configured = options.resolution_arcsec
@@ -89,7 +89,7 @@ class StepAxis:
             raise WrongDevice(
                 f"says that a {name} position is {resolution_arcsec:g} seconds of arc, "
                 f"options.{name}.resolution_arcsec {configured:g}. Either its step mode was changed, "
-                "or it is an E46 that was not homed yet (mastctl ptu home)",
+                "or it is an E46 that was not homed yet (mastctl rig ptu home)",
                 device=DEVICE,
             )
         self.name = name

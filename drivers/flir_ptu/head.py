@@ -8,8 +8,8 @@ responsible for the service's soft limits and not for the decision what to do ab
   confirmed by the unit's echo, so a goal that was garbled on the way never starts. ``A`` is not used, since
   it holds back every answer until the motion is over.
 - Once a limit hit or a changed position has shown that the unit has lost count (`drivers.flir_ptu.axis`),
-  it is read but not moved until it was homed (``mastctl ptu home``), which sweeps the full range and which
-  this driver never does, and opened anew.
+  it is read but not moved until it was homed (``mastctl rig ptu home``), which sweeps the full range and
+  which this driver never does, and opened anew.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A unit on the bench: what it says about itself, and homing it. For ``mastctl ptu``, not for the head."""
+"""A unit on the bench: its values, and homing it. For ``mastctl rig ptu``, not for the head."""
 
 from __future__ import annotations
 

@@ -111,12 +111,12 @@ class Change:
     def words(self) -> str:
         """Say what the servo is left with, and how to go on."""
         ids, bauds = " or ".join(map(str, self.ids)), " or ".join(map(str, self.bauds))
-        scan = f"'mastctl servo scan {self.line} --baud {bauds.replace(' or', '')}' shows which"
+        scan = f"'mastctl rig servo scan {self.line} --baud {bauds.replace(' or', '')}' shows which"
         sentence = f"the servo is left with the id {ids} at {bauds} baud: {scan}"
         if self.new_baud is None:
             return sentence
         new, old = self.ids[-1], self.bauds[0]
-        command = f"mastctl servo set-id {self.line} {new} {new} --baud {old} --new-baud {self.new_baud}"
+        command = f"mastctl rig servo set-id {self.line} {new} {new} --baud {old} --new-baud {self.new_baud}"
         return f"{sentence}, and '{command}' gives the id {new} its rate"
 
 
@@ -175,7 +175,7 @@ class ServoBench:
 
     def numbering(self, port: str, baud: int) -> str:
         """Return the command that gives a new servo, alone on a line, the second id."""
-        return f"mastctl servo set-id {line_words(port, self.family)} 1 2 --baud {baud}"
+        return f"mastctl rig servo set-id {line_words(port, self.family)} 1 2 --baud {baud}"
 
     def one_id(self, port: str, baud: int) -> str:
         """Return what to do where one id is all that answers."""

@@ -267,4 +267,4 @@ class BusHead(PanTilt):
             words = (
                 "closing was broken off when its time was over: an axis may still move, or keep its torque"
             )
-            log.warning("%s: %s; 'mastctl halt' stops the head", self.settings.port, words)
+            log.warning("%s: %s; 'mastctl stop --without-daemon' stops the head", self.settings.port, words)

@@ -1,4 +1,4 @@
-"""Axes that are to stand: when one does, waiting for that, and what ``mastctl halt`` does to a head."""
+"""Axes at rest: when one is, waiting for that, and ``mastctl stop --without-daemon`` of a head."""
 
 from __future__ import annotations
 

@@ -211,7 +211,7 @@ class HeadSettings(DriverOptions):
                 "baud",
                 f"{self.baud}: reading both servos takes {1000 * wire_s:.1f} ms, too long for "
                 f"poll_hz {self.poll_hz:g}; {math.ceil(self.poll_bytes * 10 * self.poll_hz)} baud or more is "
-                "expected (mastctl servo set-id has --new-baud)",
+                "expected (mastctl rig servo set-id has --new-baud)",
             )
         return self
 

@@ -95,7 +95,7 @@ def test_the_commands_for_a_servo_write_only_what_is_listed(
             workshop.set_id(link, 1, 7, 57_600)
         finally:
             link.close()
-    assert written == listed["mastctl servo set-id"]
+    assert written == listed["mastctl rig servo set-id"]
 
 
 def test_a_ptu_is_never_told_to_save() -> None:

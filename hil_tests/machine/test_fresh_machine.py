@@ -31,7 +31,7 @@ SERVOS = """
 [Service]
 User=mastctl
 RuntimeDirectory=servos
-ExecStart=/opt/mastctl/bin/mastctl sim dynamixel --pty --link /run/servos/line --servo xl330_m288:1 \
+ExecStart=/opt/mastctl/bin/mastctl rig sim dynamixel --pty --link /run/servos/line --servo xl330_m288:1 \
 --servo xl330_m288:2 --baud 1000000
 """
 
@@ -236,7 +236,7 @@ def test_systemctl_stop_stops_the_head_first_and_nothing_starts_again(machine: B
 PTU = f"""
 [Service]
 User=mastctl
-ExecStart=/opt/mastctl/bin/mastctl sim ptu --tcp {HEAD}:4000
+ExecStart=/opt/mastctl/bin/mastctl rig sim ptu --tcp {HEAD}:4000
 """
 
 

@@ -92,7 +92,7 @@ def test_a_command_that_is_ended_unwinds_once_and_tells_the_signal(
     words: list[str] = []
     before = signal.getsignal(signal.SIGHUP)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mastctl.cli.service._status", ended)
+        patch.setattr("mastctl.cli.service.client_of", ended)
         assert main(["status"]) == 128 + signal.SIGUSR1
     assert words == ["made safe"]
     assert capsys.readouterr().err == "mastctl: interrupted\n"

@@ -77,9 +77,9 @@ def test_a_client_that_hangs_stops_the_head_and_wakes_to_nothing(
 def test_the_command_turns_for_some_seconds_and_says_where_it_let_go(
     pair: tuple[RunningDaemon, FakeHardware], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["jog", "--rates", "0.1", "-0.05", "--seconds", "0.6", "--url", pair[0].url]
+    words = ["point", "--rates", "0.1", "-0.05", "--seconds", "0.6", "--url", pair[0].url]
     assert main(words) == 0
-    assert capsys.readouterr().out.startswith("let go at pan +0.")
+    assert capsys.readouterr().out.startswith("released at pan +0.")
     assert len(moves(pair[1])) > 1
 
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import sys
+import math
+from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
-from mastctl.cli.output import check_file, check_folder, unusable
+from mastctl.cli.options import command, option
+from mastctl.cli.output import Answer, Shown, WrongUse, check_file, check_folder, unusable
 
 if TYPE_CHECKING:
     from calib.files.mast_file import StoredRig
@@ -20,66 +23,73 @@ TESTS_SHOWN = 4
 SURVEY_FILES = ("survey.yaml", "station.csv", "images.csv", "dots.csv", "clicks.csv")
 
 
-def add_commands(subparsers: Any) -> None:
-    """Add ``calibrate``."""
-    parser = subparsers.add_parser(
-        "calibrate",
-        help="fit cameras and mast to a survey, and write the mast file",
-        description="Reads a survey folder (docs/how-to/calibrate.md), checks it, finds dots where "
-        "there are none, fits cameras and mast, and writes the mast file with its uncertainty. Every former "
-        "version is kept: the last as NAME.previous.yaml, those before as NAME.previous-1.yaml and so on. "
-        "With --refine it corrects the body cameras of a mast file by hand-offs instead, as a new mast file. "
-        "If they show no significant correction, it writes nothing and exits with 1.",
-    )
-    parser.add_argument(
-        "survey",
-        type=Path,
-        metavar="SURVEY",
-        help="the survey folder; with --refine the mast file",
-    )
-    parser.add_argument(
-        "--refine",
-        type=Path,
-        action="append",
-        metavar="HANDOFFS.jsonl",
-        help="record of hand-offs to correct the body cameras by; may be given several times",
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="MAST.yaml", help="the mast file to write")
-    parser.add_argument("--report", type=Path, metavar="DIR", help="folder for calibration.html")
-    parser.add_argument(
-        "--method",
-        choices=("paper", "joint"),
-        help="paper: cameras first, then the mast; joint (default): everything together, weighted",
-    )
-    parser.add_argument(
-        "--mast",
+def _model(text: str) -> str:
+    """Read a camera model's name (argparse ``type``)."""
+    from calib.geometry.cahvor import KINDS
+
+    if text.upper() not in KINDS:
+        known = ", ".join(kind.lower() for kind in KINDS)
+        raise argparse.ArgumentTypeError(f"'{text}' is not a camera model; known are {known}")
+    return text.upper()
+
+
+MODELS = (
+    option(
+        "--model MODEL",
+        "camera model of all cameras: cahv, cahvor, cahvore, opencv4, opencv5, opencv8, opencv12, "
+        "opencv14 or opencv_fisheye (default: as survey.yaml says)",
+        type=_model,
+    ),
+    option(
+        "--compare-models",
+        "also fit each camera as other models, compare them by pictures left out of the fit, and name "
+        "the one that earns its parameters",
+    ),
+)
+
+
+@command(
+    "calibrate",
+    option("SURVEY", "the survey folder; with --refine the mast file"),
+    option(
+        "--refine HANDOFFS.jsonl",
+        "record of hand-offs to correct the body cameras by; may be given several times",
+        repeat=True,
+    ),
+    option("--out MAST.yaml", "the mast file to write", required=True),
+    option("--report DIR", "folder for calibration.html"),
+    option(
+        "--method paper|joint",
+        "paper: cameras first, then the mast; joint (default): everything together, weighted",
+    ),
+    option(
+        "--mast 4|6|8",
+        "mast parameters: 4 upright, 6 the paper's (default), 8 two skew axes",
         type=int,
         choices=(4, 6, 8),
-        help="mast parameters: 4 upright, 6 the paper's (default), 8 two skew axes",
-    )
-    output.add_model(parser)
-    parser.add_argument(
-        "--in-use",
-        type=Path,
-        metavar="MAST.yaml",
-        help="the mast file to compare with (default: what --out held before)",
-    )
-    parser.set_defaults(run=run)
-
-
-def run(args: argparse.Namespace) -> int:
+    ),
+    *MODELS,
+    option("--in-use MAST.yaml", "the mast file to compare with (default: what --out was before)"),
+    example="survey --out mast.yaml --report report",
+    about="Reads a survey folder (docs/how-to/calibrate.md), checks it, finds dots where "
+    "there are none, fits cameras and mast, and writes the mast file with its uncertainty. Every former "
+    "version is kept: the last as NAME.previous.yaml, those before as NAME.previous-1.yaml and so on. "
+    "With --refine it corrects the body cameras of a mast file by hand-offs instead, as a new mast file. "
+    "If they show no significant correction, it writes nothing and exits with 1.",
+)
+def _calibrate(args: argparse.Namespace) -> Answer:
     """Read, check, find dots, fit, save, report; nothing is written before the fit is good."""
-    if args.model is not None and args.refine:
-        raise output.WrongUse("--model is for a survey; a correction keeps the cameras' models")
     if args.refine:
+        if args.model is not None:
+            raise WrongUse("--model is for a survey; a correction keeps the cameras' models")
         from mastctl.cli import calibrate_refine
 
-        return calibrate_refine.run(args)
+        return calibrate_refine.refine(args)
     args.method, args.mast = args.method or "joint", args.mast or 6
     return _from_survey(args)
 
 
-def _from_survey(args: argparse.Namespace) -> int:
+def _from_survey(args: argparse.Namespace) -> Answer:
     from calib.survey.reader import read_survey
     from mastctl.calibration.run import SurveyRefused, calibrate, checked_survey, sentence_of
 
@@ -90,7 +100,7 @@ def _from_survey(args: argparse.Namespace) -> int:
         checked_survey(survey, args.method)
     except SurveyRefused as refusal:
         for finding in refusal.findings[1:]:
-            output.tell(str(finding))  # the first is told last, as the reason
+            output.tell(str(finding))  # the first comes last, as the reason
         raise
     _check_out(args.out, survey)
     check_folder(args.report, "--report")
@@ -102,18 +112,12 @@ def _from_survey(args: argparse.Namespace) -> int:
     with output.waiting(args.json, f"fitting {len(survey.images)} images ({args.method})"):
         done = calibrate(survey, args.out, args.method, args.mast, warnings, undetected)
     page = _report(args, done, in_use)
-    told, lines = _families(args, survey)
-    if args.json:
-        output.print_json(_document(done, in_use, page) | told)
-    else:
-        _show(done, in_use, page)
-        for line in lines:
-            sys.stdout.write(output.one_line(line) + "\n")
-    return 0
+    models, lines = families_of(args, survey)
+    return Answer(_document(done, in_use, page) | models, chain(_shown(done, in_use, page), lines))
 
 
-def _families(args: argparse.Namespace, survey: Survey) -> tuple[dict[str, Any], list[str]]:
-    """What ``--compare-models`` adds for programs and for people."""
+def families_of(args: argparse.Namespace, survey: Survey) -> tuple[dict[str, Any], list[str]]:
+    """Return what ``--compare-models`` adds for programs and for people."""
     if not args.compare_models:
         return {}, []
     from mastctl.calibration import families
@@ -235,38 +239,35 @@ def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> 
 
 
 def _finite(number: float) -> float | None:
-    import math
-
     return float(number) if math.isfinite(number) else None
 
 
-def _show(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> None:
-    """Tables for people."""
+def _shown(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> Iterator[Shown]:
     from mastctl.calibration.report import camera_table, change_summary, mast_table
     from mastctl.calibration.tested import component_table, finding_table
 
     fit = done.calibration
-    output.print_table(
+    yield Shown(
         f"Mast ({fit.method}, {fit.mast_parameters} parameters, {fit.seconds:.1f} s)", *mast_table(fit)
     )
-    output.print_table("Cameras", *camera_table(fit), fit.notes)
+    yield Shown("Cameras", *camera_table(fit), fit.notes)
     if (components := component_table(done.survey, fit)) is not None:
-        output.print_table("Measurements", *components)
+        yield Shown("Measurements", *components)
     if (wider := finding_table("wider model", fit.wider, TESTS_SHOWN)) is not None:
-        output.print_table("Wider models, the likeliest first", *wider)
+        yield Shown("Wider models, the likeliest first", *wider)
     if (boards := finding_table("placement", fit.contradictions, TESTS_SHOWN)) is not None:
-        output.print_table("Boards by the others, the least likely first", *boards)
+        yield Shown("Boards by the others, the least likely first", *boards)
     if fit.outliers:
         shown = [[outlier.name, _off(outlier)] for outlier in fit.outliers[:OUTLIERS_SHOWN]]
         more = len(fit.outliers) - len(shown)
         notes = [f"and {more} more, all in the mast file under fit.outliers"] if more > 0 else []
-        output.print_table(f"Left out ({len(fit.outliers)})", ["measurement", "off by"], shown, notes)
+        yield Shown(f"Left out ({len(fit.outliers)})", ["measurement", "off by"], shown, notes)
     if fit.degenerate:
         rows = [[", ".join(d.parameters[:4]), d.sentence] for d in fit.degenerate]
-        output.print_table("Left open by the survey", ["parameters", "why"], rows)
+        yield Shown("Left open by the survey", ["parameters", "why"], rows)
     if in_use is not None and (changes := change_summary(fit, in_use)):
         rows = [[pair, *(f"{change[key]:.2f}" for key in change)] for pair, change in changes.items()]
-        output.print_table(
+        yield Shown(
             f"Pointing would change against {in_use.path.name}, px",
             ["pair", "clicked, median", "most", "position, median", "most"],
             rows,
@@ -275,7 +276,7 @@ def _show(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> None
     notes = [f"mast file: {done.saved.path} ({done.saved.digest[:12]})"]
     notes += [f"kept from before: {done.previous}"] if done.previous is not None else []
     notes += [f"report: {page}"] if page is not None else []
-    output.print_table(f"Verdict: {done.verdict.words}", ["", "reason"], reasons, notes)
+    yield Shown(f"Verdict: {done.verdict.words}", ["", "reason"], reasons, notes)
 
 
 def _off(outlier: Any) -> str:

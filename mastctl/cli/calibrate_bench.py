@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 from mastctl import signals
 from mastctl.cli import output
-from mastctl.cli.output import CommandError, WrongUse, check_file, check_folder
+from mastctl.cli.calibrate import MODELS, families_of
+from mastctl.cli.options import Group, at_least, command, one_of, option
+from mastctl.cli.output import Answer, CommandError, WrongUse, check_file, check_folder
 
 if TYPE_CHECKING:
     from calib.plan.placements import Placement
@@ -26,81 +28,61 @@ if TYPE_CHECKING:
 COMMAND = "calibrate bench"
 
 
-def add_commands(subparsers: Any) -> None:
-    """Add ``calibrate bench``."""
-    parser = subparsers.add_parser(
-        COMMAND,
-        help="fit cameras, axes and joints to pictures of a board that stands anywhere; drives the head",
-        description="Turns the head to look for a board, chooses each next pose by its expected information, "
-        "and asks for two to four placements of the board. It ends by itself when the wanted pointing error "
-        "is met (docs/how-to/calibrate.md). Everything seen is kept in a folder: a run that ended "
-        "goes on with the same command. With FOLDER such a folder is fitted again, and nothing moves.",
-    )
-    parser.add_argument(
-        "folder", nargs="?", type=Path, metavar="FOLDER", help="a bench's folder to fit again"
-    )
-    parser.add_argument(
-        "--config", metavar="RIG.yaml", help="the head's configuration (default: packaged bench)"
-    )
-    parser.add_argument("--url", help="a running daemon, instead of one that is started")
-    parser.add_argument("--board", type=Path, metavar="BOARD.yaml", help="the board ('mastctl board make')")
-    parser.add_argument("--out", type=Path, required=True, metavar="MAST.yaml", help="the mast file to write")
-    parser.add_argument("--report", type=Path, metavar="DIR", help="folder for bench.html")
-    parser.add_argument(
-        "--survey",
-        type=Path,
-        metavar="DIR",
-        help="folder for what is seen (default: MAST.bench beside --out)",
-    )
-    parser.add_argument(
-        "--pictures", type=output.at_least(12), default=60, metavar="N",
-        help="of each camera, at most (default 60)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--wanted-px", type=output.positive_number, default=0.2, metavar="PX",
-        help="wanted error of a first pointing from the calibration, rms an axis (default 0.2)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--cameras", nargs="+", metavar="NAME", help="which cameras (default: all that the daemon has)"
-    )
-    parser.add_argument(
-        "--by-hand", action="store_true",
-        help="of a simulated bench: wait for Enter at each placement as at a real one",
-    )  # fmt: skip
-    where = parser.add_argument_group(
-        "where the rover frame is, which pictures cannot show (default: where the mast file in use has it; "
-        "of a FOLDER: as its run had it)"
-    ).add_mutually_exclusive_group()
-    pose = ("X", "Y", "Z", "RX", "RY", "RZ")
-    where.add_argument(
-        "--mast-at", type=float, nargs=6, metavar=pose,
-        help="the mast stands there (metres, radians as in a mast file), as level and tape say",
-    )  # fmt: skip
-    where.add_argument(
-        "--mast-like", type=Path, metavar="MAST.yaml", help="the mast stands as in this mast file"
-    )
-    where.add_argument(
-        "--board-at", type=float, nargs=6, metavar=("X", "Y", "Z", "YAW", "PITCH", "ROLL"),
-        help="the first placement's board stands there: its middle (metres), and its turn about the rover's "
-        "z, y, x (degrees; 0 0 0: upright, its face towards the rover)",
-    )  # fmt: skip
-    where.add_argument(
-        "--body-stays", action="store_true", help="body cameras stay where the former mast file has them"
-    )
-    again = parser.add_argument_group("with FOLDER")
-    output.add_model(again)
-    parser.set_defaults(run=run)
+FRAME = Group(
+    (
+        one_of(
+            option(
+                "--mast-at X Y Z RX RY RZ",
+                "the mast's place (metres, radians as in a mast file), as level and tape show it",
+                type=float,
+            ),
+            option("--mast-like MAST.yaml", "the mast's place as in this mast file"),
+            option(
+                "--board-at X Y Z YAW PITCH ROLL",
+                "the first placement's board: its middle (metres), and its turn about the rover's "
+                "z, y, x (degrees; 0 0 0: upright, its face towards the rover)",
+                type=float,
+            ),
+            option("--body-stays", "body cameras stay where the former mast file has them"),
+        ),
+    ),
+    title="where the rover frame is, which pictures cannot show (default: where the mast file in use has it; "
+    "of a FOLDER: as its run had it)",
+)
 
 
-def run(args: argparse.Namespace) -> int:
+@command(
+    "calibrate bench",
+    option("[FOLDER]", "a bench's folder to fit again"),
+    option("--config RIG.yaml", "the head's configuration (default: packaged bench)"),
+    option("--url ADDRESS", "a running daemon, instead of one that is started"),
+    option("--board BOARD.yaml", "the board ('mastctl board make')"),
+    option("--out MAST.yaml", "the mast file to write", required=True),
+    option("--report DIR", "folder for bench.html"),
+    option("--survey DIR", "folder for what is seen (default: MAST.bench beside --out)"),
+    option("--pictures N", "of each camera, at most", type=at_least(12), default=60),
+    option(
+        "--wanted-px PX", "wanted error of a first pointing from the calibration, rms an axis", default=0.2
+    ),
+    option("--cameras NAME...", "which cameras (default: all that the daemon has)"),
+    option("--by-hand", "of a simulated bench: wait for Enter at each placement as at a real one"),
+    FRAME,
+    Group(MODELS, title="with FOLDER"),
+    help="fit cameras, axes and joints to pictures of a board that stands anywhere; drives the head",
+    example="--config rig.yaml --board board.yaml --out mast.yaml --report report",
+    about="Turns the head to find a board, chooses each next pose by its expected information, "
+    "and asks for two to four placements of the board. It ends by itself when the wanted pointing error "
+    "is met (docs/how-to/calibrate.md). Everything seen is kept in a folder: a run that ended "
+    "goes on with the same command. With FOLDER such a folder is fitted again, and nothing moves.",
+)
+def _run(args: argparse.Namespace) -> Answer:
     """Drive the head, or fit a folder again."""
     check_file(args.out, "--out")
     check_folder(args.report, "--report")
     if args.folder is not None:
-        for option in ("config", "url", "board", "survey", "cameras", "by_hand"):
-            if getattr(args, option) not in (None, False):
-                name = option.replace("_", "-")
-                raise WrongUse(f"--{name} drives a head; with FOLDER nothing is driven")
+        for name in ("config", "url", "board", "survey", "cameras", "by_hand"):
+            if getattr(args, name) not in (None, False):
+                raise WrongUse(f"--{name.replace('_', '-')} drives a head; with FOLDER nothing is driven")
         return _again(args)
     if args.model is not None or args.compare_models:
         raise WrongUse("--model and --compare-models are for fitting a folder again; name a bench's FOLDER")
@@ -114,7 +96,7 @@ def survey_folder(out: Path) -> Path:
     return out.with_name(f"{out.stem}.bench")
 
 
-def _again(args: argparse.Namespace) -> int:
+def _again(args: argparse.Namespace) -> Answer:
     from calib.calibrate.bench.problem import BenchOptions
     from calib.survey.reader import read_survey
     from mastctl.bench.folder import former_rig, kept_frame, kept_moved
@@ -134,17 +116,10 @@ def _again(args: argparse.Namespace) -> int:
     with output.waiting(args.json, f"fitting {len(survey.images)} images"):
         former, moved = former_rig(args.folder), kept_moved(args.folder)
         done = save_bench(survey, args.out, args.report, options, frame, former, moved)
-    document, lines = done.as_json(), list(done.lines())
-    if args.compare_models:
-        from mastctl.calibration import families
-
-        survey = survey if args.model is None else survey.as_model(args.model)
-        with output.waiting(args.json, "comparing camera models"):
-            found = families.compared(survey)
-        document |= {"models": families.families_told(survey, found)}
-        lines += families.families_lines(survey, found)
-    _show(args, document, done, lines)
-    return 0
+    if args.compare_models and args.model is not None:
+        survey = survey.as_model(args.model)
+    models, lines = families_of(args, survey)
+    return _answer(done, models, lines)
 
 
 def _frame(args: argparse.Namespace) -> RoverFrame:
@@ -154,10 +129,10 @@ def _frame(args: argparse.Namespace) -> RoverFrame:
     from calib.files.mast_file import load_rig
     from mastctl.bench.frame import RoverFrame
 
-    for option in ("mast_at", "board_at"):
-        numbers = getattr(args, option)
+    for name in ("mast_at", "board_at"):
+        numbers = getattr(args, name)
         if numbers is not None and not all(math.isfinite(number) for number in numbers):
-            raise WrongUse(f"--{option.replace('_', '-')} holds a number that is not finite")
+            raise WrongUse(f"--{name.replace('_', '-')} has a number that is not finite")
     mast_at = args.mast_at
     if args.mast_like is not None:
         mast = load_rig(args.mast_like).rig.mast
@@ -165,7 +140,7 @@ def _frame(args: argparse.Namespace) -> RoverFrame:
     return RoverFrame(mast_at, args.board_at, args.body_stays)
 
 
-def _drive(args: argparse.Namespace) -> int:
+def _drive(args: argparse.Namespace) -> Answer:
     from calib.calibrate.starts.bench import BenchNotFitted
     from calib.survey.writer import NotWritten
     from calib.targets.board_file import load_board
@@ -195,8 +170,11 @@ def _drive(args: argparse.Namespace) -> int:
             number = getattr(interrupt, "number", signal.SIGINT)
             sentence = f"interrupted; {kept}" if folder.exists() else "interrupted"
             raise CommandError("interrupted", sentence, 128 + number) from None
-    _show(args, done.as_json(), done, done.lines())
-    return 0
+    return _answer(done, {}, [])
+
+
+def _answer(done: BenchDone, models: dict[str, Any], lines: list[str]) -> Answer:
+    return Answer(done.as_json() | models, [*done.lines(), *lines, done.verdict_line()])
 
 
 def _go_on(args: argparse.Namespace, reason: Exception, folder: Path) -> bool:
@@ -295,7 +273,7 @@ def _daemon(args: argparse.Namespace) -> Iterator[Client]:
             client.status()
             yield client
         return
-    config = load_config(args.config or str(config_folder() / "bench.yaml"))
+    config = load_config(args.config or config_folder() / "bench.yaml")
     listen = config.listen
     if listen.socket is not None or listen.port:
         with Client(listen.url, timeout_s=5.0, name=COMMAND) as client:
@@ -319,13 +297,3 @@ def _daemon(args: argparse.Namespace) -> Iterator[Client]:
         daemon = RunningDaemon(replace(config, listen=Listen(port=0)))
     with daemon, Client(daemon.url, name=COMMAND) as client:
         yield client
-
-
-def _show(args: argparse.Namespace, document: dict[str, Any], done: BenchDone, lines: list[str]) -> None:
-    if args.json:
-        output.print_json(document)
-    else:
-        output.print_lines(lines, done.verdict_line(), COLOURS[done.verdict.grade])
-
-
-COLOURS = {"good": "bold green", "care": "bold yellow", "bad": "bold red"}

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
+from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, check_file
 
 if TYPE_CHECKING:
     from calib.calibrate.body import BodyPose
@@ -17,15 +20,15 @@ if TYPE_CHECKING:
 OUTLIERS_SHOWN = 20
 
 
-def run(args: argparse.Namespace) -> int:
-    """Propose a correction as a new mast file; 1, and no file, if the hand-offs tell none."""
+def refine(args: argparse.Namespace) -> Answer:
+    """Propose a correction as a new mast file; 1, and no file, if the hand-offs show none."""
     from calib.files.mast_file import load_rig
     from mastctl.calibration.refined import propose, save_refined
     from mastctl.watch.handoffs import read_log
 
     unused = {"--report": args.report, "--in-use": args.in_use, "--method": args.method, "--mast": args.mast}
     if given := [option for option, value in unused.items() if value is not None]:
-        raise output.WrongUse(f"{given[0]} belongs to a survey; --refine corrects by hand-offs alone")
+        raise WrongUse(f"{given[0]} belongs to a survey; --refine corrects by hand-offs alone")
     _check_out(args.out, [args.survey, *args.refine])
     mast = load_rig(args.survey)
     for note in mast.notes:
@@ -34,26 +37,20 @@ def run(args: argparse.Namespace) -> int:
     if not proposal.significant:
         refusal = proposal.refusal()
         if not args.json:
-            _show(proposal)
-        raise output.CommandError(
+            output.show(args, Answer({}, _shown(proposal)))
+        raise CommandError(
             refusal.code, f"{refusal}; nothing was written", detail=_document(proposal, None, None)
         )
     saved, previous = save_refined(proposal, args.out)
-    if args.json:
-        output.print_json(_document(proposal, saved, previous))
-    else:
-        _show(proposal)
-        _show_saved(proposal, saved, previous)
-    return 0
+    shown = chain(_shown(proposal), _saved(proposal, saved, previous))
+    return Answer(_document(proposal, saved, previous), shown)
 
 
 def _check_out(out: Path, read: list[Path]) -> None:
-    """Refuse to overwrite what is read: a proposal is a new file."""
-    from mastctl.cli.output import check_file
-
+    """Refuse to overwrite what is read: a proposal is a new file. Raises CommandError."""
     for path in read:
         if out.resolve() == path.resolve():
-            raise output.WrongUse(f"--out {out} is what is read; name another file, for the proposal")
+            raise WrongUse(f"--out {out} is what is read; name another file, for the proposal")
     check_file(out, "--out")
 
 
@@ -83,73 +80,60 @@ def _document(proposal: Proposal, saved: StoredRig | None, previous: Path | None
     }
 
 
-def _show(proposal: Proposal) -> None:
-    """What the hand-offs say, pair by pair."""
-    notes = [one.sentence for one in proposal.bias]
-    if proposal.other_mast:
-        notes.append(f"{proposal.other_mast} hand-offs of another mast file were passed over")
-    for group, pose in proposal.poses.items():
-        _show_pose(group, pose)
-    for group, why in proposal.refusals.items():
-        notes.append(f"{group}: {why}")
-    if not proposal.poses:
-        for note in notes:
-            output.tell(note)
-        return
-    rows = [
-        [camera, *(f"{x:.2f}, {y:.2f}" for x, y in sizes)]
-        for pose in proposal.poses.values()
-        for camera, sizes in pose.rms_px.items()
-    ]
-    title = "Found less predicted, rms x, y px"
-    output.print_table(title, ["camera", "before", "after the correction"], rows, notes)
-
-
-def _show_pose(group: str, pose: BodyPose) -> None:
+def _shown(proposal: Proposal) -> Iterator[str | Shown]:
+    """The corrections and the mean offsets, pair by pair."""
     from calib.calibrate.body import STEP_NAMES
     from mastctl.calibration.refined import SHIFT_FIRST
 
-    sigma = pose.covariance.diagonal() ** 0.5
-    rows = [
-        [STEP_NAMES[i], f"{1e3 * pose.step[i]:+.2f}", f"{1e3 * sigma[i]:.2f}", "mrad" if i < 3 else "mm"]
-        for i in SHIFT_FIRST
-    ]
+    for group, pose in proposal.poses.items():
+        sigma = pose.covariance.diagonal() ** 0.5
+        significance = f"{pose.sigmas:.1f} sigma ({'' if pose.significant else 'not '}significant)"
+        yield Shown(
+            f"{group} against the mast cameras: {significance}, {len(pose.used.handoffs)} hand-offs",
+            ("about the pair's middle, rover axes", "correction", "sigma", "unit"),
+            [
+                (
+                    STEP_NAMES[i],
+                    f"{1e3 * pose.step[i]:+.2f}",
+                    f"{1e3 * sigma[i]:.2f}",
+                    "mrad" if i < 3 else "mm",
+                )
+                for i in SHIFT_FIRST
+            ],
+            _notes(pose),
+        )
+    yield from (one.sentence for one in proposal.bias)
+    yield from (f"{group}: {why}" for group, why in proposal.refusals.items())
+    if proposal.other_mast:
+        yield f"{proposal.other_mast} hand-offs of another mast file were passed over"
+
+
+def _notes(pose: BodyPose) -> list[str]:
     notes = [
-        f"chi-square {pose.chi2_before:.0f} before, {pose.chi2_after:.0f} after, "
-        f"{pose.degrees_of_freedom:.0f} degrees of freedom",
-        *pose.unseen,
-        *(one.sentence for one in pose.outliers[:OUTLIERS_SHOWN]),
+        f"{camera}, found less predicted: {before[0]:.2f}, {before[1]:.2f} px rms before, "
+        f"{after[0]:.2f}, {after[1]:.2f} px after"
+        for camera, (before, after) in pose.rms_px.items()
     ]
+    notes += [*pose.unseen, *(one.sentence for one in pose.outliers[:OUTLIERS_SHOWN])]
     if len(pose.outliers) > OUTLIERS_SHOWN:
         notes.append(f"and {len(pose.outliers) - OUTLIERS_SHOWN} more were not used, all named by --json")
     if pose.scale > 1.0:
-        notes.append(f"the sigmas are widened by {pose.scale**0.5:.2f}, as the residuals ask")
+        notes.append(f"the sigmas are widened by {pose.scale**0.5:.2f}, as the residuals require")
     if pose.cameras_apart is not None and pose.cameras_apart.sigmas > 3.0:
         x, y = pose.cameras_apart.offset_px
         notes.append(
-            f"right and left camera differ by {x:+.2f}, {y:+.2f} px ({pose.cameras_apart.sigmas:.1f} sigma): "
-            "no motion of the pair explains it. One camera or its model is off; survey the pair again"
+            f"right and left camera differ by {x:+.2f}, {y:+.2f} px "
+            f"({pose.cameras_apart.sigmas:.1f} sigma): no motion of the pair explains it. "
+            "One camera or its model is off; survey the pair again"
         )
-    words = f"{pose.sigmas:.1f} sigma ({'' if pose.significant else 'not '}significant)"
-    output.print_table(
-        f"{group} against the mast cameras: {words}, {len(pose.used.handoffs)} hand-offs",
-        ["about the pair's middle, rover axes", "correction", "sigma", "unit"],
-        rows,
-        notes,
-    )
+    return notes
 
 
-def _show_saved(proposal: Proposal, saved: StoredRig, previous: Path | None) -> None:
-    covariance = "covariance" in saved.rig.fit
-    notes = [
-        f"proposed mast file: {saved.path} ({saved.digest[:12]}); {proposal.mast.path} is as it was",
-        "its covariance is that after the correction"
-        if covariance
-        else "it has no covariance, as the former file has none",
-        "a daemon uses it after 'mastctl mast use' (docs/how-to/calibrate.md, Use the mast file)",
-    ]
-    notes += [f"kept from before: {previous}"] if previous is not None else []
-    output.print_table(
-        "Corrected", ["pair", "cameras"],
-        [[group, ", ".join(pose.cameras)] for group, pose in proposal.significant.items()], notes,
-    )  # fmt: skip
+def _saved(proposal: Proposal, saved: StoredRig, previous: Path | None) -> Iterator[str]:
+    known = "is that after the correction" if "covariance" in saved.rig.fit else "is unknown, as before"
+    corrected = ", ".join(name for pose in proposal.significant.values() for name in pose.cameras)
+    yield f"proposed mast file: {saved.path} ({saved.digest[:12]}); {corrected} corrected"
+    yield f"its covariance {known}"
+    yield f"{proposal.mast.path} is as it was; a daemon uses the new one after 'mastctl rig mast use'"
+    if previous is not None:
+        yield f"kept from before: {previous}"

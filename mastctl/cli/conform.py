@@ -5,11 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mastctl import signals
 from mastctl.cli import output
-from mastctl.cli.output import WrongUse, positive_number
+from mastctl.cli.options import command, one_of, option, positive_number
+from mastctl.cli.output import Answer, Shown, WrongUse
 
 if TYPE_CHECKING:
     from mastctl.conform.checks import Check, CheckOutcome
@@ -17,48 +18,42 @@ if TYPE_CHECKING:
 MARKS = {"passed": "ok", "failed": "FAILED", "skipped": "-"}
 
 
-def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add conform."""
-    parser = subparsers.add_parser("conform", help="accept a rig through its running daemon")
-    parser.add_argument("url", nargs="?", metavar="URL", help="a running daemon's address")
-    motion = parser.add_mutually_exclusive_group()
-    motion.add_argument(
-        "--motion", dest="motion", action="store_true", default=None, help="move the head without a question"
-    )
-    motion.add_argument(
-        "--no-motion", dest="motion", action="store_false", help="only checks that move nothing"
-    )
-    parser.add_argument(
-        "--reach", type=positive_number, default=0.3, metavar="RAD",
-        help="how far from its present pose the head is moved (default 0.3 rad)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--only", action="append", metavar="CHECK", help="a check, or all of a group; may be given often"
-    )
-    parser.add_argument("--list", action="store_true", help="only list the checks")
-    parser.set_defaults(run=_conform)
-
-
-def _conform(args: argparse.Namespace) -> int:
-    """Check a rig; return the exit code."""
+@command(
+    "conform",
+    option("[URL]", "a running daemon's address"),
+    one_of(
+        option("--motion", "move the head without a question", default=None),
+        option("--no-motion", "only checks that move nothing", dest="motion", action="store_false"),
+    ),
+    option(
+        "--reach RAD",
+        "how far from its present pose the head is moved (default 0.3 rad)",
+        type=positive_number,
+        default=0.3,
+    ),
+    option("--only CHECK", "a check, or all of a group; may be given often", repeat=True),
+    option("--list", "only list the checks"),
+    example="http://127.0.0.1:8420",
+)
+def _conform(args: argparse.Namespace) -> Answer:
     from mastctl.conform.rig import check_rig, rig_under_test
     from mastctl.conform.rig_checks import RIG
 
     checks = _chosen(RIG, args.only)
     if args.list:
-        return _list(checks, args.json)
+        rows = [(check.name, "moves" if check.moves else "", check.promise) for check in checks]
+        document = {"checks": [{"name": c.name, "promise": c.promise, "moves": c.moves} for c in checks]}
+        return Answer(document, Shown("checks", ("name", "head", "what has to hold"), rows))
     if args.url is None:
         raise WrongUse("the address of a daemon is expected, e.g. http://127.0.0.1:8420")
     with rig_under_test(args.url, args.reach) as rig:
         motion = _may_move(args, checks, bool(rig.began.get("simulated")))
         report = check_rig(rig, checks, motion, (lambda outcome: None) if args.json else _show)
-    if args.json:
-        output.print_json(report.as_json())
-    else:
-        counts = ", ".join(f"{count} {state}" for state, count in report.counts.items())
-        verdict = "conforms" if report.conforms else "does not conform"
-        sys.stdout.write(f"daemon {report.subject} {verdict}: {counts}\n")
-    return 0 if report.conforms else 1
+    counts = ", ".join(f"{count} {state}" for state, count in report.counts.items())
+    verdict = "conforms" if report.conforms else "does not conform"
+    return Answer(
+        report.as_json(), f"daemon {report.subject} {verdict}: {counts}", 0 if report.conforms else 1
+    )
 
 
 def _may_move(args: argparse.Namespace, checks: Sequence[Check], simulated: bool) -> bool:
@@ -75,26 +70,15 @@ def _may_move(args: argparse.Namespace, checks: Sequence[Check], simulated: bool
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
-def _chosen(checks: Sequence[Check], names: Sequence[str] | None) -> list[Check]:
+def _chosen(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
     """The checks that --only names, by name or group; all without it. Raises WrongUse."""
-    if names is None:
+    if not names:
         return list(checks)
     for name in names:
         if not any(name in (check.name, check.name.partition(".")[0]) for check in checks):
             groups = ", ".join(dict.fromkeys(check.name.partition(".")[0] for check in checks))
             raise WrongUse(f"--only {name}: no such check; groups are {groups}, --list shows all")
     return [c for c in checks if c.name in names or c.name.partition(".")[0] in names]
-
-
-def _list(checks: Sequence[Check], as_json: bool) -> int:
-    """Show the checks."""
-    if as_json:
-        rows = [{"name": c.name, "promise": c.promise, "moves": c.moves} for c in checks]
-        output.print_json({"checks": rows})
-    else:
-        lines = [(check.name, "moves" if check.moves else "", check.promise) for check in checks]
-        output.print_table("checks", ("name", "head", "what has to hold"), lines)
-    return 0
 
 
 def _show(outcome: CheckOutcome) -> None:

@@ -8,33 +8,23 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 import mastctl
 from mastctl.cli import output
-from mastctl.cli.output import check_folder
-from mastctl.cli.tasks import (
-    add_run_options,
-    add_task_options,
-    at_least_one,
-    refuse_task_options,
-    results_of,
-    run_bar,
-    simulated_daemon,
-    tell_report,
-)
+from mastctl.cli.daemon import DAEMON, client_of, refuse_daemon_options
+from mastctl.cli.options import command, option
+from mastctl.cli.output import Answer, Shown, WrongUse, check_folder
+from mastctl.cli.rig import HEADS
+from mastctl.cli.tasks import TASKS, refuse_task_options, results_of, run_bar, simulated_daemon
 
 if TYPE_CHECKING:
     from mastctl.client import Client
     from mastctl.experiment.pointing import ClickTruth, PointingExperiment, TargetRecord
 
-DEFAULT_TARGETS = 10
-DEMO_TARGETS = 3  # a first contact: a minute with installation and compiling
 DEFAULT_DISTANCES_M = (10.0, 6.0, 2.0)
-HEADS = ("ptu_d46_70", "dynamixel_x", "ph42")
 STUDIES = {
     "handoff": "hand targets over from Pancam to Navcam to Hazcam and measure the errors",
     "approach": "follow a rock from 10 m to 1 m on the simulated rover, beside the paper's Table I",
@@ -43,74 +33,15 @@ STUDIES = {
 """Experiments that are ``tools.studies.NAME`` in a checkout; their own ``--help`` has their options."""
 
 
-def add_commands(subparsers: Any) -> None:
-    """Add ``experiment`` and ``demo``."""
-    experiment = subparsers.add_parser("experiment", help="the paper's experiments")
-    kinds = experiment.add_subparsers(dest="experiment", metavar="EXPERIMENT", required=True)
-    pointing = kinds.add_parser("pointing", help="point at random textured targets and measure the residuals")
-    from mastctl.cli.service import add_daemon_options
-
-    add_daemon_options(pointing)
-    _add_common(
-        pointing, out_help="folder for report.html, targets.csv and record.json; none is written without"
-    )
-    pointing.add_argument(
-        "--distances", type=output.positive_number, nargs="+", default=list(DEFAULT_DISTANCES_M), metavar="M",
-        help="ranges in metres (default 10 6 2)",
-    )  # fmt: skip
-    pointing.add_argument(
-        "--simulated", action="store_true",
-        help="on the packaged simulated rover, a fresh one for each target, compared with the truth",
-    )  # fmt: skip
-    pointing.add_argument(
-        "--head", choices=HEADS, help="with --simulated: the simulated head (default ptu_d46_70)"
-    )
-    add_task_options(pointing)
-    pointing.set_defaults(run=run_pointing)
-
-    for name, summary in STUDIES.items():
-        study = kinds.add_parser(name, help=f"{summary} (in a checkout)", add_help=False)
-        study.set_defaults(run=lambda args: become_study(args.experiment, ()))
-
-    demo = subparsers.add_parser("demo", help="the pointing experiment on the packaged simulated rover")
-    _add_common(demo, "folder for the report (default mastctl_demo)", DEMO_TARGETS)
-    demo.add_argument(
-        "--config", type=Path, metavar="FILE",
-        help="a simulated rig of one's own, with its own seed; --seed then chooses views and pixels only",
-    )  # fmt: skip
-    demo.add_argument(
-        "--head", choices=HEADS,
-        help="simulated head (default ptu_d46_70, or that of --wire)",
-    )  # fmt: skip
-    demo.add_argument(
-        "--wire", metavar="DRIVER",
-        help="drive the head through this real driver and a byte simulator (default: in memory)",
-    )  # fmt: skip
-    demo.add_argument(
-        "--speed", type=_speed, metavar="N",
-        help="1: the rover takes its time; 10: a tenth of it; max: nothing waits (default)",
-    )  # fmt: skip
-    demo.set_defaults(run=run_demo, out=Path("mastctl_demo"))
+SEED = option("--seed SEED", "chooses views and pixels", default=1)
 
 
 def _speed(text: str) -> float | str:
-    """A number, or a word that the configuration judges."""
+    """Read a number; the configuration judges any other text (argparse ``type``)."""
     try:
         return float(text)
     except ValueError:
         return text
-
-
-def _add_common(parser: argparse.ArgumentParser, out_help: str, targets: int = DEFAULT_TARGETS) -> None:
-    """Options that both commands take."""
-    parser.add_argument(
-        "--targets",
-        type=at_least_one,
-        default=targets,
-        metavar="N",
-        help=f"targets at each distance (default {targets})",
-    )
-    add_run_options(parser, "chooses views and pixels", out_help)
 
 
 def study_of(words: Sequence[str]) -> tuple[str, list[str]] | None:
@@ -131,7 +62,7 @@ def become_study(name: str, options: Sequence[str]) -> NoReturn:
     """
     root = Path(mastctl.__file__).parents[1]
     if not (root / "tools" / "studies" / f"{name}.py").is_file():
-        raise output.WrongUse(
+        raise WrongUse(
             f"'experiment {name}' is a program of mastctl's source code, which is not in {root}; in a clone "
             f"of it, run tools/setup and then '.venv/bin/mastctl experiment {name}'"
         )
@@ -140,28 +71,48 @@ def become_study(name: str, options: Sequence[str]) -> NoReturn:
     os.execve(command[0], command, os.environ | {"PYTHONPATH": path})
 
 
-def run_pointing(args: argparse.Namespace) -> int:
-    """Run the experiment on the daemon that --url or --config names, or on simulated rovers of its own."""
-    from mastctl.cli.service import client_of
+def _study(name: str) -> Callable[[argparse.Namespace], int]:
+    return lambda args: become_study(name, ())
 
+
+for _name, _summary in STUDIES.items():
+    command(f"experiment {_name}", help=f"{_summary} (in a checkout)")(_study(_name))
+
+
+@command(
+    "experiment pointing",
+    *DAEMON,
+    option("--targets N", "targets at each distance", default=10),
+    SEED,
+    option("--out DIR", "folder for report.html, targets.csv and record.json; none is written without"),
+    option("--distances M...", "ranges in metres", default=list(DEFAULT_DISTANCES_M)),
+    option(
+        "--simulated", "on the packaged simulated rover, a fresh one for each target, compared with the truth"
+    ),
+    option(f"--head {HEADS}", "with --simulated: the simulated head (default ptu_d46_70)"),
+    TASKS,
+    help="point at random textured targets and measure the residuals",
+    example="--targets 20 --out pointing",
+)
+def run_pointing(args: argparse.Namespace) -> Answer:
+    """Run the experiment on the daemon that --url or --config names, or on simulated rovers of its own."""
     check_folder(args.out, "--out")
     if args.simulated:
         return _run_simulated(args)
     if args.head is not None:
-        raise output.WrongUse("--head belongs to --simulated; a running daemon has its own head")
+        raise WrongUse("--head belongs to --simulated; a running daemon has its own head")
     refuse_task_options(args)
     with client_of(args) as client:
         return _report(args, _run(args, client, tuple(args.distances), None, ()))
 
 
-def _run_simulated(args: argparse.Namespace) -> int:
+def _run_simulated(args: argparse.Namespace) -> Answer:
     """Run each target on a simulated rover of its own."""
-    from mastctl.cli.service import refuse_daemon_options
     from mastctl.experiment.pointing_report import PICTURES_PER_DISTANCE
     from mastctl.experiment.simulated import PointingTask, Rover, joined_pointings, one_pointing
 
     refuse_daemon_options(args)
-    rover = Rover(args.head or HEADS[0], args.seed)
+    rover = Rover(args.head or HEADS.split("|")[0], args.seed)
     shown = PICTURES_PER_DISTANCE if args.out is not None else 0
     tasks = [
         PointingTask(rover, distance_m, index, index < shown)
@@ -177,10 +128,30 @@ def _run_simulated(args: argparse.Namespace) -> int:
         lambda part: part.records[0].error,
         found=lambda part: _residuals(part.records[0]),
     )
-    return 0 if parts is None else _report(args, joined_pointings(parts))
+    return _report(args, joined_pointings(parts))
 
 
-def run_demo(args: argparse.Namespace) -> int:
+@command(
+    "demo",
+    option("--targets N", "targets at each distance", default=3),
+    SEED,
+    option("--out DIR", "folder for the report", default=Path("mastctl_demo")),
+    option(
+        "--config FILE",
+        "a simulated rig of one's own, with its own seed; --seed then chooses views and pixels only",
+    ),
+    option(f"--head {HEADS}", "simulated head (default ptu_d46_70, or that of --wire)"),
+    option(
+        "--wire DRIVER", "drive the head through this real driver and a byte simulator (default: in memory)"
+    ),
+    option(
+        "--speed N",
+        "1: the rover takes its time; 10: a tenth of it; max: nothing waits (default)",
+        type=_speed,
+    ),
+    example="--out demo",
+)
+def run_demo(args: argparse.Namespace) -> Answer:
     """Start a simulated rover behind a daemon on a free port, and run the experiment on it."""
     from mastctl.config import load_config
     from mastctl.experiment.pointing import head_pair
@@ -241,22 +212,20 @@ def _run(
 
 
 def _residuals(record: TargetRecord) -> str:
-    """What each pointing at a target left, in one line."""
+    """The residuals of the pointings at a target, in one line."""
     left = (f"{x:+.2f}, {y:+.2f} px" for x, y in (landing.residual_px for landing in record.landings))
     return f"{record.range_m:.2f} m away, residual " + ", then ".join(left)
 
 
-def _report(args: argparse.Namespace, experiment: PointingExperiment) -> int:
-    """Write the report if asked, print the table or the document; 1 if no target at all landed."""
+def _report(args: argparse.Namespace, experiment: PointingExperiment) -> Answer:
+    """Write the report if it is wanted; 1 if no target at all landed."""
     from mastctl.experiment.pointing_report import pointing_table, write_pointing_report
 
-    def show(notes: list[str]) -> None:
-        hardware = experiment.status.get("hardware")
-        output.print_table(
-            f"Pointing residuals, rms px ({experiment.camera}, {hardware} hardware)",
-            *pointing_table(experiment.summaries).turned(),
-            [*experiment.notes, *notes],
-        )
-
-    tell_report(args, partial(write_pointing_report, experiment), experiment.as_json, show)
-    return 0 if any(record.landings for record in experiment.records) else 1
+    page = None if args.out is None else write_pointing_report(experiment, args.out)
+    shown = Shown(
+        f"Pointing residuals, rms px ({experiment.camera}, {experiment.status.get('hardware')} hardware)",
+        *pointing_table(experiment.summaries).turned(),
+        [*experiment.notes, *([] if page is None else [f"report: {page}"])],
+    )
+    document = experiment.as_json() | ({} if page is None else {"report": str(page)})
+    return Answer(document, shown, 0 if any(record.landings for record in experiment.records) else 1)

@@ -4,112 +4,79 @@ from __future__ import annotations
 
 import argparse
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli import output
 from mastctl.cli.mast_files import camera_name, nearest_of, need_joints, read_mast_file, stereo_pair
-from mastctl.cli.output import finite_number, positive_number
+from mastctl.cli.options import command, option, positive_number
+from mastctl.cli.output import Answer, Shown, WrongUse
 
 if TYPE_CHECKING:
-    from calib.geometry.covariance import RigCovariance
     from calib.geometry.handoff import Handoff, Joints
     from calib.geometry.rig import Rig
 
-MAST_HELP = "the mast file"
-FROM_HELP = "present angle; solutions near it come first (default: 0)"
-SIGMA_HELP = "one sigma of a click, each axis (default: 0.2)"
+MAST = option("MAST.yaml", "the mast file")
+STEREO = (
+    option("--pan RAD", "true joint angle"),
+    option("--tilt RAD", "true joint angle"),
+    option("--left U V", "pixel in the left image", required=True),
+    option("--right U V", "pixel in the right image", required=True),
+    option("--sigma-px PX", "one sigma of a click, each axis", default=0.2),
+)
+PRESENT = "present angle; solutions near it come first"
 
 
-def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add solve, triangulate, budget and handoff."""
-    for add in (_add_geometry, _add_handoff):
-        add(subparsers)
-
-
-def _add_geometry(subparsers: Any) -> None:
-    """Add the commands of this module to the parser's commands."""
-    solve = subparsers.add_parser("solve", help="the true joint angles that bring a target onto a pixel")
-    solve.add_argument("mast", type=Path, metavar="MAST.yaml", help=MAST_HELP)
-    solve.add_argument("--camera", required=True, metavar="NAME", help="a camera on the head")
-    solve.add_argument(
-        "--target", required=True, nargs=3, type=finite_number, metavar=("X", "Y", "Z"), help="rover frame, m"
-    )
-    solve.add_argument(
-        "--pixel", nargs=2, type=finite_number, metavar=("U", "V"), help="default: the image centre"
-    )
-    solve.add_argument("--from-pan", type=finite_number, default=0.0, metavar="RAD", help=FROM_HELP)
-    solve.add_argument("--from-tilt", type=finite_number, default=0.0, metavar="RAD", help=FROM_HELP)
-    solve.set_defaults(run=solve_pointing)
-
-    triangulate = subparsers.add_parser(
-        "triangulate", help="the point that a stereo pair sees, with covariance"
-    )
-    triangulate.add_argument("mast", type=Path, metavar="MAST.yaml", help=MAST_HELP)
-    triangulate.add_argument(
-        "--pair", required=True, metavar="NAME", help="a pair of the file's stereo section"
-    )
-    triangulate.add_argument("--pan", type=finite_number, metavar="RAD", help="true joint angle")
-    triangulate.add_argument("--tilt", type=finite_number, metavar="RAD", help="true joint angle")
-    for side in ("--left", "--right"):
-        triangulate.add_argument(
-            side,
-            required=True,
-            nargs=2,
-            type=finite_number,
-            metavar=("U", "V"),
-            help=f"pixel in the {side[2:]} image",
-        )
-    triangulate.add_argument("--sigma-px", type=positive_number, default=0.2, metavar="PX", help=SIGMA_HELP)
-    triangulate.set_defaults(run=triangulate_pair)
-
-    budget = subparsers.add_parser("budget", help="the paper's error budget (Table I) from its formulas")
-    budget.set_defaults(run=error_budget)
-
-
-def solve_pointing(args: argparse.Namespace) -> int:
+@command(
+    "solve",
+    MAST,
+    option("--camera NAME", "a camera on the head", required=True),
+    option("--target X Y Z", "rover frame, m", required=True),
+    option("--pixel U V", "default: the image centre"),
+    option("--from-pan RAD", PRESENT, default=0.0),
+    option("--from-tilt RAD", PRESENT, default=0.0),
+    example="mast.yaml --camera navcam_left --target 6 1 0",
+)
+def solve_pointing(args: argparse.Namespace) -> Answer:
     """Solve for the joint angles that bring a target in the rover frame onto a pixel."""
     from calib.geometry.pointing import solve
 
     stored = read_mast_file(args.mast)
     camera = stored.rig.cameras[camera_name(stored, args.camera)]
     if camera.on != "head":
-        raise output.WrongUse(
-            f"camera '{args.camera}' is on the rover's body; a camera on the head is expected"
-        )
+        raise WrongUse(f"camera '{args.camera}' is on the rover's body; a camera on the head is expected")
     solutions = solve(
-        stored.rig.mast,
-        camera.model,
-        args.target,
-        args.pixel,
-        from_pan_rad=args.from_pan,
-        from_tilt_rad=args.from_tilt,
-    )
-    if args.json:
-        keys = ("pan_rad", "tilt_rad", "range_m")
-        output.print_json({"solutions": [{key: float(getattr(s, key)) for key in keys} for s in solutions]})
-        return 0
+        stored.rig.mast, camera.model, args.target, args.pixel,
+        from_pan_rad=args.from_pan, from_tilt_rad=args.from_tilt,
+    )  # fmt: skip
     x, y = camera.model.image_center_px if args.pixel is None else args.pixel
-    target = "(" + ", ".join(f"{value:g}" for value in args.target) + ")"
-    output.print_table(
-        f"{stored.rig.name}: target {target} m on pixel ({x:g}, {y:g}) of {args.camera}",
+    target = ", ".join(f"{value:g}" for value in args.target)
+    rows = [
+        (
+            *(f"{angle:.9f}" for angle in (one.pan_rad, one.tilt_rad)),
+            *(f"{math.degrees(angle):.4f}" for angle in (one.pan_rad, one.tilt_rad)),
+            f"{one.range_m:.6f}",
+        )
+        for one in solutions
+    ]
+    shown = Shown(
+        f"{stored.rig.name}: target ({target}) m on pixel ({x:g}, {y:g}) of {args.camera}",
         ("pan rad", "tilt rad", "pan deg", "tilt deg", "range m"),
-        [
-            (
-                f"{s.pan_rad:.9f}",
-                f"{s.tilt_rad:.9f}",
-                f"{math.degrees(s.pan_rad):.4f}",
-                f"{math.degrees(s.tilt_rad):.4f}",
-                f"{s.range_m:.6f}",
-            )
-            for s in solutions
-        ],
-        ["best first; the mast's limits belong to a configuration and are not looked at here"],
+        rows,
+        ["best first; the mast's limits belong to a configuration and are not applied"],
     )
-    return 0
+    keys = ("pan_rad", "tilt_rad", "range_m")
+    return Answer(
+        {"solutions": [{key: float(getattr(one, key)) for key in keys} for one in solutions]}, shown
+    )
 
 
-def triangulate_pair(args: argparse.Namespace) -> int:
+@command(
+    "triangulate",
+    MAST,
+    option("--pair NAME", "a pair of the file's stereo section", required=True),
+    *STEREO,
+    example="mast.yaml --pair navcam --pan 0.3 --tilt -0.2 --left 300 420 --right 271 420",
+)
+def triangulate_pair(args: argparse.Namespace) -> Answer:
     """Triangulate the point seen at a pixel of each camera of a pair, in the rover frame."""
     from calib.geometry.covariance import clicked_point, stored_covariance
 
@@ -121,85 +88,55 @@ def triangulate_pair(args: argparse.Namespace) -> int:
         rig, pair, args.pan or 0.0, args.tilt or 0.0, args.left, args.right,
         sigma_px=args.sigma_px, calibration=stored_covariance(rig),
     )  # fmt: skip
-    if args.json:
-        output.print_json(
-            {
-                "position_m": seen.position_m.tolist(),
-                "covariance_m2": seen.covariance_m2.tolist(),
-                "ray_gap_m": seen.ray_gap_m,
-            }
-        )
-        return 0
     sigmas_mm = [1e3 * math.sqrt(max(0.0, variance)) for variance in seen.covariance_m2.diagonal()]
-    output.print_table(
+    document = {
+        "position_m": seen.position_m.tolist(),
+        "covariance_m2": seen.covariance_m2.tolist(),
+        "ray_gap_m": seen.ray_gap_m,
+    }
+    axes = zip("xyz", document["position_m"], sigmas_mm, strict=True)
+    shown = Shown(
         f"{rig.name}: the point that {args.pair} sees, in the rover frame",
         ("", "m", "sigma mm"),
-        [
-            (axis, f"{value:.6f}", f"{sigma:.3f}")
-            for axis, value, sigma in zip("xyz", seen.position_m, sigmas_mm, strict=True)
-        ],
+        [(axis, f"{value:.6f}", f"{sigma:.3f}") for axis, value, sigma in axes],
         [
             f"ray gap {1e3 * seen.ray_gap_m:.3f} mm, {gap.sigmas:.1f} sigma; "
             f"sigma from {args.sigma_px:g} px in each pixel coordinate"
         ],
     )
-    return 0
+    return Answer(document, shown)
 
 
-def error_budget(args: argparse.Namespace) -> int:
+@command("budget")
+def error_budget(args: argparse.Namespace) -> Answer:
     """Compute the paper's Table I."""
     from calib.geometry.stereo import target_approach_budget
 
-    rows = target_approach_budget()
     keys = ("stereo_cm", "untracked_cm", "tracked_cm")
-    if args.json:
-        output.print_json(
-            {"cameras": [{"name": row.name, **{key: getattr(row, key) for key in keys}} for row in rows]}
-        )
-        return 0
-    output.print_table(
+    rows = target_approach_budget()
+    shown = Shown(
         "Target approach from 10 m to 1 m, 3-sigma errors (Table I of the paper)",
         ("camera", "stereo cm", "untracked cm", "tracked cm"),
         [(row.name, *(f"{getattr(row, key):.2f}" for key in keys)) for row in rows],
     )
-    return 0
-
-
-def _add_handoff(subparsers: Any) -> None:
-    """Add the command to the parser's commands."""
-    handoff = subparsers.add_parser(
-        "handoff", help="where a target seen by one stereo pair falls in another, with the ellipse to search"
+    return Answer(
+        {"cameras": [{"name": row.name, **{key: getattr(row, key) for key in keys}} for row in rows]}, shown
     )
-    handoff.add_argument("mast", type=Path, metavar="MAST.yaml", help=MAST_HELP)
-    handoff.add_argument("--from", dest="source", required=True, metavar="PAIR", help="the pair that sees it")
-    handoff.add_argument("--to", required=True, metavar="PAIR", help="a pair, or one camera")
-    handoff.add_argument("--pan", type=finite_number, metavar="RAD", help="true joint angle")
-    handoff.add_argument("--tilt", type=finite_number, metavar="RAD", help="true joint angle")
-    for side in ("--left", "--right"):
-        handoff.add_argument(
-            side,
-            required=True,
-            nargs=2,
-            type=finite_number,
-            metavar=("U", "V"),
-            help=f"pixel in the {side[2:]} image",
-        )
-    handoff.add_argument("--to-pan", type=finite_number, metavar="RAD", help="default: as --pan")
-    handoff.add_argument("--to-tilt", type=finite_number, metavar="RAD", help="default: as --tilt")
-    handoff.add_argument(
-        "--point",
-        action="store_true",
-        help="turn the head first so that the target falls in the middle of --to",
-    )
-    handoff.add_argument("--sigma-px", type=positive_number, default=0.2, metavar="PX", help=SIGMA_HELP)
-    handoff.add_argument(
-        "--sigma-joint", type=positive_number, metavar="RAD", help="of a joint reading; default: exact"
-    )
-    handoff.set_defaults(run=hand_over)
 
 
-def hand_over(args: argparse.Namespace) -> int:
-    """Hand a target over, geometrically."""
+@command(
+    "handoff",
+    MAST,
+    option("--from PAIR", "the pair that sees it", dest="source", required=True),
+    option("--to PAIR", "a pair, or one camera", required=True),
+    *STEREO,
+    option("--to-pan RAD", "default: as --pan"),
+    option("--to-tilt RAD", "default: as --tilt"),
+    option("--sigma-joint RAD", "of a joint reading; default: exact", type=positive_number),
+    example="mast.yaml --from navcam --to hazcam --pan 0.3 --tilt -0.2 --left 300 420 --right 271 420",
+)
+def hand_over(args: argparse.Namespace) -> Answer:
+    """Hand a target over, geometrically, with the ellipse to search."""
     from calib.geometry.covariance import stored_covariance
     from calib.geometry.handoff import Joints, hand_off
 
@@ -207,67 +144,27 @@ def hand_over(args: argparse.Namespace) -> int:
     rig, pair = stored.rig, stereo_pair(stored, args.source)
     if args.to not in rig.stereo and args.to not in rig.cameras:
         known = nearest_of(args.to, [*rig.stereo, *rig.cameras])
-        raise output.WrongUse(f"no stereo pair or camera '{args.to}' in {args.mast}; {known}")
+        raise WrongUse(f"no stereo pair or camera '{args.to}' in {args.mast}; {known}")
     to = rig.stereo.get(args.to, (args.to,))
-    on_head = any(rig.cameras[name].on == "head" for name in (*pair, *to))
-    if on_head and (args.pan is None or args.tilt is None):
-        raise output.WrongUse("a camera is on the head; --pan RAD and --tilt RAD are expected")
-    sigma = args.sigma_joint or 0.0
-    joints = Joints(args.pan or 0.0, args.tilt or 0.0, sigma)
+    for name in (*pair, *to):
+        need_joints(rig, name, args)
+    joints = Joints(args.pan or 0.0, args.tilt or 0.0, args.sigma_joint or 0.0)
     calibration = stored_covariance(rig)
     done = hand_off(
-        rig,
-        pair,
-        to,
-        joints,
-        args.left,
-        args.right,
-        to_joints=_destination(args, rig, pair, to[0], joints, calibration),
-        sigma_px=args.sigma_px,
-        calibration=calibration,
-    )
-    if args.json:
-        output.print_json(_as_json(done))
-    else:
-        _print(args, rig, done)
-    return 0
+        rig, pair, to, joints, args.left, args.right,
+        to_joints=_destination(args, joints),
+        sigma_px=args.sigma_px, calibration=calibration,
+    )  # fmt: skip
+    return Answer(_as_json(done), _shown(args, rig, done))
 
 
-def _destination(
-    args: argparse.Namespace,
-    rig: Rig,
-    pair: tuple[str, str],
-    aim: str,
-    joints: Joints,
-    calibration: RigCovariance | None,
-) -> Joints | None:
+def _destination(args: argparse.Namespace, joints: Joints) -> Joints | None:
     """The joint angles of the destination images; None where the head does not turn."""
-    from calib.geometry.covariance import clicked_point
     from calib.geometry.handoff import Joints
-    from calib.geometry.pointing import solve
 
-    if args.point:
-        if args.to_pan is not None or args.to_tilt is not None:
-            raise output.WrongUse("--point chooses the angles; leave --to-pan and --to-tilt out")
-        if rig.cameras[aim].on != "head":
-            raise output.WrongUse(f"--point: camera '{aim}' is on the rover's body and cannot be pointed")
-        seen, _ = clicked_point(
-            rig, pair, joints.pan_rad, joints.tilt_rad, args.left, args.right,
-            sigma_px=args.sigma_px, sigma_rad=joints.sigma_rad, calibration=calibration,
-        )  # fmt: skip
-        best = solve(
-            rig.mast,
-            rig.cameras[aim].model,
-            seen.position_m,
-            from_pan_rad=joints.pan_rad,
-            from_tilt_rad=joints.tilt_rad,
-        )[0]
-        return Joints(best.pan_rad, best.tilt_rad, joints.sigma_rad)
     pan = joints.pan_rad if args.to_pan is None else args.to_pan
     tilt = joints.tilt_rad if args.to_tilt is None else args.to_tilt
-    if (pan, tilt) == (joints.pan_rad, joints.tilt_rad):
-        return None
-    return Joints(pan, tilt, joints.sigma_rad)
+    return None if (pan, tilt) == (joints.pan_rad, joints.tilt_rad) else Joints(pan, tilt, joints.sigma_rad)
 
 
 def _as_json(done: Handoff) -> dict[str, Any]:
@@ -294,7 +191,7 @@ def _as_json(done: Handoff) -> dict[str, Any]:
     }
 
 
-def _print(args: argparse.Namespace, rig: Rig, done: Handoff) -> None:
+def _shown(args: argparse.Namespace, rig: Rig, done: Handoff) -> Shown:
     import numpy as np
 
     rows = []
@@ -319,9 +216,9 @@ def _print(args: argparse.Namespace, rig: Rig, done: Handoff) -> None:
     notes.append(f"head at pan {done.pan_rad:.6f}, tilt {done.tilt_rad:.6f} rad")
     gap = f"{1e3 * done.seen.ray_gap_m:.2f} mm, {done.gap.sigmas:.1f} sigma"
     notes.append(f"target at ({x:.4f}, {y:.4f}, {z:.4f}) m, rover frame; rays pass at {gap}")
-    what = ["clicks"] + ["joints"] * bool(args.sigma_joint) + ["calibration"] * ("covariance" in rig.fit)
-    notes.append(f"3-sigma half axes of where to search, from {', '.join(what)}; angle from x towards y")
-    output.print_table(
+    sources = ["clicks"] + ["joints"] * bool(args.sigma_joint) + ["calibration"] * ("covariance" in rig.fit)
+    notes.append(f"3-sigma half axes of where to search, from {', '.join(sources)}; angle from x towards y")
+    return Shown(
         f"{rig.name}: from {args.source} to {args.to}",
         ("camera", "x px", "y px", "search px", "angle deg"),
         rows,

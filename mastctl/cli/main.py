@@ -1,9 +1,8 @@
-"""The door of the command line: choose the command, run it, tell a refusal in one line with its exit code.
+"""The entry point of the command line: choose the command, run it, print its answer or a refusal in one line.
 
 Exit codes: 0 success, 2 wrong use or bad input, 1 failure, 130 interrupted (128 and the number of the signal
-that ended it), 141 nobody reads the output.
-A command module offers ``add_commands(subparsers)`` and sets ``run=function(args) -> int`` on each of its
-commands. Only the module of the command that was asked for is imported; a module imports what is
+that ended it), 141 where the reader of the output is gone.
+Only the modules of the command that is wanted are imported; a module imports what is
 slow (numpy, cv2, numba, fastapi) inside its functions.
 """
 
@@ -16,7 +15,6 @@ import importlib
 import io
 import logging
 import os
-import re
 import signal
 import sys
 import threading
@@ -26,74 +24,77 @@ from typing import Any, NoReturn
 
 from mastctl import signals
 from mastctl.cli import output
+from mastctl.cli.options import DECLARED, GROUPS, Command, Parser, add_options
 from mastctl.logs import TEXT, QueuedHandler, writer_to
 
 log = logging.getLogger(__name__)
 
-# Which module brings which command, in the order in which the help shows them.
-MODULES: dict[str, tuple[str, ...]] = {
-    "mastctl.cli.service": ("run", "status", "point", "snapshot"),
-    "mastctl.cli.stop": ("stop", "estop", "reset", "halt"),
-    "mastctl.cli.steering": ("lease", "track", "jog"),
-    "mastctl.cli.operations": ("reload", "operations", "events", "mast", "fault"),
-    "mastctl.cli.setup": ("token", "completion", "doctor", "schema"),
-    "mastctl.cli.camera_files": ("camera",),
-    "mastctl.cli.geometry": ("solve", "triangulate", "budget", "handoff"),
-    "mastctl.cli.board": ("board",),
-    "mastctl.cli.calibrate": ("calibrate",),
-    "mastctl.cli.calibrate_bench": ("calibrate bench",),
-    "mastctl.cli.experiment": ("experiment", "demo"),
-    "mastctl.cli.conform": ("conform",),
-    "mastctl.cli.record": ("record", "replay"),
-    "mastctl.cli.sim": ("sim",),
-    "mastctl.cli.rig": ("rig",),
-    "mastctl.cli.sentinel": ("sentinel",),
-    "mastctl.cli.servos": ("servo", "ptu"),
-    "mastctl.cli.ros2": ("ros2",),
+OVERVIEW: Mapping[str, Mapping[str, tuple[str, str]]] = {
+    "a running daemon and its mast": {
+        "run": ("service", "run the daemon; its address is one line on stdout when it is ready"),
+        "status": ("service", "show the state of a daemon, its operations or events"),
+        "point": ("steering", "point a camera at something and measure the residual, or jog"),
+        "track": ("steering", "follow a target while the rover moves"),
+        "snapshot": ("service", "take a picture and write it to a file"),
+        "record": ("record", "begin and end a recording; list, inspect, repair and replay them"),
+        "stop": ("stop", "stop the mast at once; with --without-daemon a head whose daemon is dead"),
+        "estop": ("stop", "stop the mast at once, and let nothing move it until 'mastctl reset'"),
+        "reset": ("stop", "release an emergency stop; nothing moves by that"),
+    },
+    "geometry, on files": {
+        "camera": ("camera_files cameras camera_sync", "camera files, and cameras on this machine"),
+        "solve": ("geometry", "the true joint angles that bring a target onto a pixel"),
+        "triangulate": ("geometry", "the point that a stereo pair sees, with covariance"),
+        "handoff": ("geometry", "where a target seen by one stereo pair falls in another"),
+        "budget": ("geometry", "the paper's error budget (Table I) from its formulas"),
+    },
+    "calibration and acceptance": {
+        "board": ("board", "a board to calibrate with: make one, measure it, find it"),
+        "calibrate": ("calibrate", "fit a mast file to a survey, or 'calibrate bench': to a board anywhere"),
+        "calibrate bench": ("calibrate_bench", ""),
+        "conform": ("conform", "accept a rig through its running daemon"),
+    },
+    "a rig of your own": {
+        "rig": (
+            "rig administration servos sim sentinel",
+            "write a rig's files; its machine, servos, lease, tokens, mast file and drift",
+        ),
+        "schema": ("rig", "print the JSON Schema of a file that people write; without NAME a list"),
+        "ros2": ("ros2", "a ROS 2 node of a running daemon, until Ctrl-C"),
+    },
+    "the paper's experiments": {
+        "demo": ("experiment", "the pointing experiment on the packaged simulated rover"),
+        "experiment": ("experiment", "pointing, handoff, approach or calibration"),
+    },
 }
+"""Headings of ``mastctl --help``; each command with the modules that bring it, and what it does."""
 
-# argparse's own pattern knows -1 and -1.5 but takes -1e-3 for an option; "not finite" words get our message.
-_NEGATIVE_NUMBER = re.compile(r"^-(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?$|^-(?:inf|infinity|nan)$", re.IGNORECASE)
+COMMANDS = {words: entry for commands in OVERVIEW.values() for words, entry in commands.items()}
 
-
-class _Commands(argparse._SubParsersAction):  # type: ignore[type-arg]
-    """Commands whose own --help says what they do, in the words of the list that they stand in."""
-
-    def add_parser(self, name: str, **options: Any) -> argparse.ArgumentParser:
-        words = str(options.get("help", ""))
-        options.setdefault("description", f"{words[:1].upper()}{words[1:]}." if words else None)
-        parser: argparse.ArgumentParser = super().add_parser(name, **options)
-        example = EXAMPLES.get(parser.prog)
-        if example is not None:
-            said = f"{parser.epilog} " if parser.epilog else ""
-            parser.epilog = f"{said}example: {example}".replace("%", "%%")
-        return parser
+_URL = "--url ADDRESS may stand before a command; default: $MASTCTL_URL, else the configuration's daemon"
 
 
-class Parser(argparse.ArgumentParser):
-    """A parser that refuses in one line, reads any negative number, and gives each command --json."""
+class _Overview(Parser):
+    """The parser of ``mastctl`` alone, whose help shows the commands by their headings."""
 
-    def __init__(self, *args: Any, **options: Any) -> None:
-        options.setdefault("allow_abbrev", False)
-        super().__init__(*args, **options)
-        self._negative_number_matcher = _NEGATIVE_NUMBER
-        self.register("action", "parsers", _Commands)
-        self.add_argument(
-            "--json",
-            action="store_true",
-            default=argparse.SUPPRESS,
-            help="print one JSON document on stdout and nothing else",
-        )
-
-    def error(self, message: str) -> NoReturn:
-        """Refuse wrong use; the caller prints the one line."""
-        raise output.WrongUse(f"{message} (see '{self.prog} --help')")
+    def format_help(self) -> str:
+        """Return the usage, and the commands and options in one screen."""
+        lines = [self.format_usage().rstrip(), ""]
+        for heading, commands in OVERVIEW.items():
+            shown = ((words, help) for words, (_, help) in commands.items() if help)
+            lines += [f"{heading}:", *(f"  {words:<12} {help}" for words, help in shown)]
+        options = {
+            "COMMAND -h": "show the options of a command and an example",
+            "--json": "print one JSON document",
+        }
+        options |= {"--version": "print the version", "--print-completion SHELL": "for bash, zsh or tcsh"}
+        return "\n".join([*lines, "", *(f"{name:<25} {help}" for name, help in options.items()), _URL, ""])
 
 
 class _Version(argparse.Action):
-    """Print the installed version; reading it is slow, so only when it is asked for."""
+    """Print the installed version, which is slow to read."""
 
-    def __init__(self, option_strings: Sequence[str], dest: str, **options: Any) -> None:
+    def __init__(self, option_strings: Sequence[str], dest: str, **settings: Any) -> None:
         super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help="print the version")
 
     def __call__(self, parser: argparse.ArgumentParser, *ignored: Any) -> NoReturn:
@@ -103,32 +104,62 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def build_parser(argv: Sequence[str]) -> Parser:
-    """Return the parser; if ``argv`` names a known command, only that command's module is in it."""
-    parser = Parser(
-        prog="mastctl",
-        description="Rover mast controller: camera geometry, exact pointing, the pointing service.",
-        epilog="--url, the address of a running daemon, may stand before a command too; by default it is "
-        "$MASTCTL_URL, else that of the configuration.",
-    )
+def build_parser(wanted: str | None = None) -> Parser:
+    """Return the parser of all commands, or of those whose first word is ``wanted``."""
+    chosen = {words: entry for words, entry in COMMANDS.items() if wanted in (None, words)}
+    for modules, _ in chosen.values():
+        for module in modules.split():
+            importlib.import_module(f"mastctl.cli.{module}")
+    parser = _Overview(prog="mastctl", usage="mastctl [-h] [--version] COMMAND ...")
     parser.add_argument("--version", action=_Version)
-    subparsers = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
-    wanted = next((word for word in argv if not word.startswith("-")), None)
-    modules = [module for module, commands in MODULES.items() if wanted in commands] or list(MODULES)
-    for module in modules:
-        importlib.import_module(module).add_commands(subparsers)
+    inner = {"": parser.add_subparsers(parser_class=Parser, prog="mastctl", metavar="COMMAND", required=True)}
+    for words in chosen:
+        if words not in DECLARED:
+            _group(inner, words, COMMANDS[words][1])
+    for words, one in DECLARED.items():
+        if words in chosen or words.split()[0] in chosen:
+            _add(inner, one)
     return parser
 
 
+def _group(inner: dict[str, Any], words: str, help: str) -> None:
+    """Add a command that has commands."""
+    above, _, name = words.rpartition(" ")
+    made = inner[above].add_parser(name, help=help, description=_sentence(help))
+    inner[words] = made.add_subparsers(
+        parser_class=Parser, prog=f"mastctl {words}", metavar="COMMAND", required=True
+    )
+
+
+def _add(inner: dict[str, Any], one: Command) -> None:
+    """Add a command that does something; one below another such is joined with it, as ``calibrate bench``."""
+    above, _, name = one.words.rpartition(" ")
+    if one.words in COMMANDS:
+        above, name = "", one.words
+    elif above not in inner:
+        _group(inner, above, GROUPS[above])
+    help = one.help or COMMANDS[one.words][1]
+    made = inner[above].add_parser(
+        name, help=help, description=one.about or _sentence(help),
+        epilog=f"example: mastctl {one.words} {one.example}".rstrip().replace("%", "%%"),
+    )  # fmt: skip
+    add_options(made, *one.options)
+    made.set_defaults(run=one.run)
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}.".replace("%", "%%")
+
+
 def process() -> NoReturn:
-    """Be the process of one command: run it, and end with its exit code."""
+    """Run the command of this process, and end with its exit code."""
     # A second thread for matrices as small as ours waits busily: a fit takes half as much processor time
-    # again, and no less time. NumPy reads it when it is loaded; who has set either is obeyed.
+    # again, and no less time. NumPy reads it when it is loaded; what is set already stays.
     if "OMP_NUM_THREADS" not in os.environ:
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     code = main()
     if threading.active_count() > 1:
-        # The interpreter's own end would wait for a thread that a device holds, and end daemon threads where
+        # The interpreter's own end would wait for a thread that a device blocks, and end daemon threads where
         # they are, on which C++ (OpenCV, SciPy) aborts.
         atexit._run_exitfuncs()
         with contextlib.suppress(OSError):
@@ -153,45 +184,37 @@ def main(argv: Sequence[str] | None = None) -> int:
             # What the terminal's encoding, or none, can hold (a tick mark, a file's name) is escaped.
             stream.reconfigure(errors="backslashreplace")
     words = list(sys.argv[1:] if argv is None else argv)
-    as_json = "--json" in words
     if not logging.getLogger().handlers:
-        _log_to(sys.stderr.fileno())
+        # Through a queue: the logs of a driver or a daemon in this process never wait for a reader.
+        handler = QueuedHandler(writer_to(sys.stderr.fileno()))
+        logging.basicConfig(format=TEXT, level=logging.WARNING, handlers=[handler])
     try:
         with signals.raised():
-            code = _tell(words, as_json)
+            code = _finish(words, "--json" in words)
         sys.stdout.flush()
     except OSError as error:
-        # Nobody reads stdout any more (head, less), or its disk is full.
+        # The reader of stdout is gone (head, less), or its disk is full.
         _give_up_stdout()
         return 141 if isinstance(error, BrokenPipeError) else output.refuse(error, as_json=False)
     return code
 
 
-def _log_to(descriptor: int) -> None:
-    """Log through a queue: what a driver or a daemon in this process has to say never waits for a reader."""
-    handler = QueuedHandler(writer_to(descriptor))
-    logging.basicConfig(format=TEXT, level=logging.WARNING, handlers=[handler])
-
-
-def _refused(error: BaseException, as_json: bool) -> int:
-    """Tell a refusal, after what was logged about it."""
-    for handler in logging.getLogger().handlers:
-        handler.flush()
-    return output.refuse(error, as_json)
-
-
-def _tell(words: Sequence[str], as_json: bool) -> int:
-    """Run and turn what is raised into one line and an exit code; only a broken stdout gets out."""
+def _finish(words: Sequence[str], as_json: bool) -> int:
+    """Run, and turn what is raised into one line and an exit code; only a broken stdout gets out."""
+    refusal: BaseException
     try:
         return _run(words)
     except BrokenPipeError:
         raise
     except KeyboardInterrupt as interrupt:
         number = getattr(interrupt, "number", signal.SIGINT)
-        return _refused(output.CommandError("interrupted", "interrupted", exit_code=128 + number), as_json)
-    except Exception as error:  # the last door before the user: one line, never a traceback
+        refusal = output.CommandError("interrupted", "interrupted", exit_code=128 + number)
+    except Exception as error:  # the last place before the user: one line, never a traceback
         log.debug("refused", exc_info=True)
-        return _refused(error, as_json)
+        refusal = error
+    for handler in logging.getLogger().handlers:
+        handler.flush()  # what was logged about it comes first
+    return output.refuse(refusal, as_json)
 
 
 def _give_up_stdout() -> None:
@@ -204,157 +227,68 @@ def _give_up_stdout() -> None:
 def _run(words: Sequence[str]) -> int:
     """Parse and run; --help and --version end here with their own code."""
     try:
-        words = _as_one_word(_url_last(words))
-        _check_command(words)
-        if "experiment" in words:
-            from mastctl.cli.experiment import become_study, study_of
+        if words and words[0].startswith("--print-completion"):
+            parser = _completing()
+        else:
+            words, command = _ordered(words)
+            if command == "experiment":
+                from mastctl.cli.experiment import become_study, study_of
 
-            if (study := study_of(words)) is not None:
-                become_study(*study)
-        parser = build_parser(words)
+                if (study := study_of(words)) is not None:
+                    become_study(*study)
+            parser = build_parser(command)
         args = parser.parse_args(words)
     except SystemExit as done:
         return int(done.code or 0)
     args.json = getattr(args, "json", False)
-    return int(args.run(args))
+    answer = args.run(args)
+    return output.show(args, answer) if isinstance(answer, output.Answer) else int(answer)
 
 
-def _as_one_word(words: Sequence[str]) -> list[str]:
-    """Join a command of two words whose first is one too; a survey named as the second is ``./bench``."""
-    two = [command.split(" ") for commands in MODULES.values() for command in commands if " " in command]
-    first = next((at for at, word in enumerate(words) if not word.startswith("-")), len(words))
-    if list(words[first : first + 2]) in two:
-        return [*words[:first], " ".join(words[first : first + 2]), *words[first + 2 :]]
-    return list(words)
+def _ordered(words: Sequence[str]) -> tuple[list[str], str]:
+    """Return the words with a leading --url last and a command of two words as one, and the command.
 
-
-def _url_last(words: Sequence[str]) -> list[str]:
-    """Put a --url that stands before the command after it. Raises WrongUse if there is one already."""
-    first = next((at for at, word in enumerate(words) if word == "--url" or word.startswith("--url=")), None)
-    if first is None or any(not word.startswith("-") for word in words[:first]):
-        return list(words)
-    size = 2 if words[first] == "--url" else 1
-    url, others = words[first : first + size], [*words[:first], *words[first + size :]]
-    if any(word == "--url" or word.startswith("--url=") for word in others):
+    Raises WrongUse for an unknown command, with the nearest known one; argparse would list them all.
+    """
+    options: list[str] = []
+    url: list[str] = []
+    rest = list(words)
+    while rest and rest[0].startswith("-"):
+        place, size = (url, 2 if rest[0] == "--url" else 1) if rest[0].startswith("--url") else (options, 1)
+        place += rest[:size]
+        rest = rest[size:]
+    if not rest:
+        return [*options, *url], ""
+    if len([word for word in (*url, *rest) if word == "--url" or word.startswith("--url=")]) > 1:
         raise output.WrongUse("--url is there twice; one address is expected")
-    return [*others, *url]
+    command = rest.pop(0)
+    if command not in COMMANDS:
+        near = get_close_matches(command, COMMANDS, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(COMMANDS)}"
+        raise output.WrongUse(f"no command '{command}'; {_moved(command) or hint}")
+    if rest and f"{command} {rest[0]}" in COMMANDS:  # a folder of that name is ``./bench``
+        command = f"{command} {rest.pop(0)}"
+    return [*options, command, *rest, *url], command
 
 
-def _check_command(words: Sequence[str]) -> None:
-    """Refuse an unknown command with the nearest known one; argparse would list them all."""
-    known = [command for commands in MODULES.values() for command in commands]
-    wanted = next((word for word in words if not word.startswith("-")), None)
-    if wanted is None or wanted in known:
-        return
-    near = get_close_matches(wanted, known, n=1)
-    hint = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(known)}"
-    raise output.WrongUse(f"no command '{wanted}'; {hint}")
+def _moved(command: str) -> str:
+    """A command of this name below another one, as a hint."""
+    build_parser()
+    below = [words for words in (*GROUPS, *DECLARED) if words.split()[1:2] == [command]]
+    return f"did you mean '{below[0]}'?" if below else ""
+
+
+def _completing() -> Parser:
+    """The whole parser with --print-completion, which prints what makes a shell complete commands."""
+    try:
+        import shtab
+    except ImportError:
+        message = "shtab is not installed, which writes completions: pip install 'mastctl[completion]'"
+        raise output.CommandError("no_shtab", message) from None
+    parser = build_parser()
+    shtab.add_argument_to(parser, "--print-completion")
+    return parser
 
 
 if __name__ == "__main__":
     process()
-
-
-_ALL = """
-run --config rover.yaml
-status --json
-point --camera navcam_left --at 300 420
-snapshot navcam_left --out left.png
-stop
-estop --name Ana --reason "sparks at the mast"
-reset --name Ana --reason "cable mended"
-halt --config rover.yaml
-lease show
-lease take --for 60
-lease renew --lease 0f3c --for 60
-lease release --lease 0f3c
-token new --name wall --role view
-token list
-token revoke wall
-track start --camera navcam_left --at 300 420
-track status
-track watch --count 10
-track pose --position 4.1 0.2 0 --sigma 0.02 0.009
-track look
-track stop
-jog --rates 0.2 0 --seconds 2
-operations list
-operations show 000012-9f3a
-operations watch 000012-9f3a
-mast show --out now.yaml
-mast use rocky8-refined.yaml
-mast back
-reload
-fault list
-fault set navcam_left dark for_s=5
-fault clear navcam_left
-events state fault --count 5
-camera project mast.yaml --camera navcam_left --pan 0.3 --tilt -0.2 --points points.csv
-camera ray mast.yaml --camera navcam_left --pan 0.3 --tilt -0.2 --pixels pixels.csv
-camera convert camera.yaml camera.cahvor
-camera maps mast.yaml --pair navcam --out maps.npz
-camera list
-camera sync navcam_left navcam_right --config rover.yaml
-camera check /dev/video0 --rate 30
-camera grab /dev/video0 --out picture.png
-camera focus /dev/video0 --seconds 30
-camera settings navcam_left exposure_s=0.004 gain=20
-camera mode mast.yaml --camera navcam_left --bin 2 --flip both --out binned.yaml
-solve mast.yaml --camera navcam_left --target 6 1 0
-triangulate mast.yaml --pair navcam --pan 0.3 --tilt -0.2 --left 300 420 --right 271 420
-budget
-handoff mast.yaml --from navcam --to hazcam --pan 0.3 --tilt -0.2 --left 300 420 --right 271 420
-board make --kind charuco --paper A4 --out board.pdf
-board measured board.yaml --across-mm 149.6 --down-mm 149.8
-board find board.yaml picture.png
-calibrate survey --out mast.yaml --report report
-calibrate bench --config rig.yaml --board board.yaml --out mast.yaml --report report
-experiment pointing --targets 20 --out pointing
-experiment handoff
-experiment approach
-experiment calibration
-demo --out demo
-completion bash --install
-schema config
-conform http://127.0.0.1:8420
-doctor --config rover.yaml
-sentinel reference --folder sentinel --pose 0,-0.3
-sentinel look --folder sentinel
-sentinel watch --folder sentinel --every-s 86400
-sentinel status --folder sentinel
-record start afternoon
-record stop
-record list
-record show afternoon.mcap
-record repair broken.mcap --out whole.mcap
-replay afternoon.mcap --mast other.yaml
-sim new twin --height 1.9 --baseline 0.42
-rig new rig --pan-deg -90 90 --tilt-deg -40 30
-sim dynamixel --servo xl330_m288:1 --servo xl330_m288:2 --pty
-sim ptu --pty
-sim feetech --pty
-servo scan /dev/ttyUSB0
-servo info /dev/ttyUSB0 1
-servo set-id /dev/ttyUSB0 1 2
-ptu info /dev/ttyUSB0
-ptu home /dev/ttyUSB0
-ros2 --url http://127.0.0.1:8420
-"""
-_GROUPS = frozenset(
-    (
-        *("lease", "token", "track", "operations", "mast", "fault", "camera", "experiment", "record"),
-        *("sim", "servo", "ptu", "board", "sentinel", "rig"),
-    )
-)
-
-
-def _command_of(line: str) -> str:
-    words = line.split()
-    two = words[0] in _GROUPS or words[:2] == ["calibrate", "bench"]
-    return " ".join(words[:2] if two else words[:1])
-
-
-EXAMPLES: Mapping[str, str] = {
-    f"mastctl {_command_of(line)}": f"mastctl {line}" for line in _ALL.strip().splitlines()
-}
-"""Of a command, ``mastctl lease take``, a line that a shell would take."""

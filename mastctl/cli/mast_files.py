@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def read_mast_file(path: Path) -> StoredRig:
-    """Read a mast file; what reading it changed is told on stderr, for stdout holds the result."""
+    """Read a mast file, with its notes on stderr, for stdout holds the result."""
     from calib.files.mast_file import load_rig
 
     stored = load_rig(path)
@@ -25,13 +25,13 @@ def read_mast_file(path: Path) -> StoredRig:
 
 
 def tell_notes(notes: Iterable[str]) -> None:
-    """Tell what reading a file changed."""
+    """Write on stderr what reading a file changed."""
     for note in notes:
         output.tell(note)
 
 
 def camera_name(stored: StoredRig, name: str | None) -> str:
-    """Return the camera that was asked for, the only one by default. Raises WrongUse."""
+    """Return the camera of this name, the only one by default. Raises WrongUse."""
     cameras = stored.rig.cameras
     if name is None and len(cameras) == 1:
         return next(iter(cameras))
@@ -60,15 +60,15 @@ def need_joints(rig: Rig, name: str, args: argparse.Namespace) -> None:
         raise output.WrongUse(f"camera '{name}' is on the head; --pan RAD and --tilt RAD are expected")
 
 
-def nearest_of(word: str, known: Collection[str]) -> str:
-    """Return in words which of the known was meant, or what there is."""
+def nearest_of(name: str, known: Collection[str]) -> str:
+    """Return the nearest of the known names, or all, as a hint."""
     from calib.files.yaml_text import nearest
 
-    return nearest(word, list(known)) if known else "it has none"
+    return nearest(name, list(known)) if known else "it has none"
 
 
 def chosen_camera(path: Path, name: str | None) -> tuple[str, CameraFile]:
-    """Return the camera of a file that is meant, and its name, notes told. Raises WrongUse and BadFile."""
+    """Return the camera of a file that is meant, and its name. Raises WrongUse and BadFile."""
     from calib.files.any_camera import load_any
 
     found, camera = camera_of(load_any(path), name)

@@ -1,17 +1,16 @@
-"""How a command tells its results and refusals: JSON for programs, tables for people, one line an error."""
+"""How a command shows results and refusals: JSON for programs, tables for people, one line an error."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
 import pwd
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mastctl.report import tables
 
@@ -20,12 +19,12 @@ if TYPE_CHECKING:
 
 
 class CommandError(Exception):
-    """A command that cannot do what was asked.
+    """A command that failed.
 
     Parameters
     ----------
     code
-        A word for programs, ``snake_case``.
+        For programs, ``snake_case``.
     message
         One plain sentence.
     exit_code
@@ -55,34 +54,120 @@ def print_json(document: Mapping[str, Any]) -> None:
     sys.stdout.write(json.dumps(document, allow_nan=False) + "\n")
 
 
+class Shown(NamedTuple):
+    """A table for people, with a title and notes under it."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Iterable[Sequence[str]]
+    notes: Sequence[str] = ()
+
+
+class Answer(NamedTuple):
+    """The result of a command.
+
+    Attributes
+    ----------
+    document
+        For programs: the one JSON document.
+    shown
+        For people: a line, or lines and tables; None shows the document as `tables_of` has it.
+    code
+        The exit code.
+    """
+
+    document: Mapping[str, Any]
+    shown: str | Shown | Iterable[str | Shown] | None = None
+    code: int = 0
+
+
+def show(args: argparse.Namespace, answer: Answer) -> int:
+    """Print an answer at once, as JSON or for people, and return its exit code."""
+    if args.json:
+        print_json(answer.document)
+    else:
+        shown = answer.shown
+        for one in (
+            tables_of(answer.document)
+            if shown is None
+            else [shown]
+            if isinstance(shown, (str, Shown))
+            else shown
+        ):
+            if isinstance(one, Shown):
+                print_table(*one)
+            else:
+                indent = len(one) - len(one.lstrip(" "))
+                sys.stdout.write(" " * indent + one_line(one) + "\n")
+    sys.stdout.flush()
+    return answer.code
+
+
+def tables_of(document: Mapping[str, Any], title: str = "") -> list[Shown]:
+    """Return any record as tables: its values by their keys, and each of its lists of records by itself."""
+    if len(document) == 1 and not title:
+        [(key, value)] = document.items()
+        if isinstance(value, Mapping):
+            return tables_of(value, key)
+    lists = {key: value for key, value in document.items() if _is_rows(value)}
+    rows = [row for key, value in document.items() if key not in lists for row in _rows(key, value)]
+    found = [Shown(title, ("", ""), rows)] if rows else []
+    for key, records in lists.items():
+        columns = list(dict.fromkeys(name for record in records for name in record))
+        cells = [[cell(record.get(name)) for name in columns] for record in records]
+        found.append(Shown(key, [_plain(name) for name in columns], cells))
+    return found
+
+
+def _is_rows(value: Any) -> bool:
+    return isinstance(value, (list, tuple)) and bool(value) and all(isinstance(one, Mapping) for one in value)
+
+
+def _rows(key: str, value: Any) -> Iterable[tuple[str, str]]:
+    if isinstance(value, Mapping) and value:
+        for name, inner in value.items():
+            yield from _rows(f"{key}.{name}" if key else str(name), inner)
+    else:
+        yield _plain(key), cell(value)
+
+
+def _plain(key: str) -> str:
+    return key.replace("_", " ")
+
+
+def cell(value: Any) -> str:
+    """Return a value of a record for a cell of a table."""
+    if value is None or value == "" or value == [] or value == {}:
+        return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {cell(inner)}" for key, inner in value.items())
+    if isinstance(value, (list, tuple)):
+        return ", ".join(map(cell, value))
+    return one_line(str(value))
+
+
 def print_table(
     title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], notes: Sequence[str] = ()
 ) -> None:
-    """Write a table for people to stdout, numbers to the right and words to the left, notes under it."""
+    """Write a table to stdout, numbers to the right and texts to the left, notes under it."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     rows = list(rows)
-    table = Table(title=Text(title), title_justify="left")
+    table = Table(title=Text(title), title_justify="left", show_header=any(columns))
     for column, numeric in zip(columns, tables.Table(columns, rows).numeric, strict=True):
         table.add_column(Text(column), justify="right" if numeric else "left")
     for row in rows:
-        table.add_row(*(Text(cell) for cell in row))
+        table.add_row(*(Text(one) for one in row))
     console = Console(file=sys.stdout, soft_wrap=True)
     console.print(table)
     for note in notes:
         console.print(Text(note))
-
-
-def print_lines(lines: Iterable[str], last: str, style: str) -> None:
-    """Write lines for people to stdout, the last in a style of rich; a terminal breaks them at words."""
-    from rich.console import Console
-    from rich.text import Text
-
-    console = Console(file=sys.stdout)
-    for line, its in [*((line, "") for line in lines), (last, style)]:
-        console.print(Text(one_line(line), style=its), soft_wrap=not console.is_terminal)
 
 
 def tell(message: str) -> None:
@@ -97,7 +182,7 @@ def one_line(text: str) -> str:
 
 
 def refuse(error: BaseException, as_json: bool) -> int:
-    """Tell a refusal, as JSON on stdout or as one line on stderr, and return the exit code."""
+    """Print a refusal, as JSON on stdout or as one line on stderr, and return the exit code."""
     known = as_command_error(error)
     message = one_line(str(known)) or known.code
     if as_json:
@@ -115,7 +200,7 @@ def as_command_error(error: BaseException) -> CommandError:
     """Return what a refusal says to the outside: code, message, exit code.
 
     Bad files and bad options end with 2, everything else with 1. An error that carries a ``code`` keeps it.
-    An error that nobody foresaw is ``internal``: its type and text on one line.
+    An unforeseen error is ``internal``: its type and text on one line.
     """
     from calib.errors import BadFile, CalibError, Unreachable
     from drivers.errors import BadOptions, DriverError
@@ -130,8 +215,8 @@ def as_command_error(error: BaseException) -> CommandError:
         return CommandError("bad_options", str(error), 2)
     if isinstance(error, (CalibError, DriverError)) or isinstance(getattr(error, "code", None), str):
         detail = getattr(error, "detail", None)
-        told = detail if isinstance(detail, Mapping) else None
-        return CommandError(_code_of(error), str(error), int(getattr(error, "exit_code", 1)), told)
+        detail = detail if isinstance(detail, Mapping) else None
+        return CommandError(_code_of(error), str(error), int(getattr(error, "exit_code", 1)), detail)
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename is not None else ""
         return CommandError("file_system", f"{where}{error.strerror or error}", 1)
@@ -150,7 +235,7 @@ def _code_of(error: BaseException) -> str:
 
 
 def progress_bar(quiet: bool) -> Progress:
-    """Return a progress bar on stderr: what, how many of how many, since when. ``quiet`` shows nothing."""
+    """Return a progress bar on stderr; ``quiet`` shows nothing."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -159,91 +244,14 @@ def progress_bar(quiet: bool) -> Progress:
 
 
 def waiting(quiet: bool, what: str) -> AbstractContextManager[Any]:
-    """Return what shows on stderr what a person is waiting for, meanwhile. ``quiet`` shows nothing."""
+    """Return what shows on stderr what a person waits for; ``quiet`` shows nothing."""
     from rich.console import Console
 
     return Console(stderr=True, quiet=quiet).status(what)
 
 
-def finite_number(text: str) -> float:
-    """Read an option's value as a finite number (argparse ``type``)."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value) or "_" in text:
-        raise argparse.ArgumentTypeError(f"'{text}' where a finite number is expected")
-    return value
-
-
-def angle_rad(text: str) -> float:
-    """Read an option's value as an angle of at most a full turn, radians (argparse ``type``)."""
-    value = finite_number(text)
-    if abs(value) > math.tau:
-        raise argparse.ArgumentTypeError(
-            f"'{text}' where radians are expected, at most {math.tau:.2f} (a full turn); "
-            f"{value:g} degrees are {math.radians(value):.6g}"
-        )
-    return value
-
-
-def positive_number(text: str) -> float:
-    """Read an option's value as a finite number above zero (argparse ``type``)."""
-    value = finite_number(text)
-    if value <= 0:
-        raise argparse.ArgumentTypeError(f"'{text}' where a number above zero is expected")
-    return value
-
-
-def not_negative(text: str) -> float:
-    """Read an option's value as a finite number of zero or more (argparse ``type``)."""
-    value = finite_number(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"'{text}' where zero or more is expected")
-    return value
-
-
-def at_least(least: int) -> Callable[[str], int]:
-    """Return what reads an option's value as a whole number of at least ``least`` (argparse ``type``)."""
-
-    def read(text: str) -> int:
-        if not text.isascii() or not text.isdigit() or int(text) < least:
-            raise argparse.ArgumentTypeError(f"'{text}' where a whole number of at least {least} is expected")
-        return int(text)
-
-    return read
-
-
-def add_model(parser: Any) -> None:
-    """Add ``--model`` to a parser or a group of one."""
-    parser.add_argument(
-        "--model",
-        type=_model_kind,
-        metavar="MODEL",
-        help="camera model of all cameras: cahv, cahvor, cahvore, opencv4, opencv5, opencv8, opencv12, "
-        "opencv14 or opencv_fisheye (default: as survey.yaml says)",
-    )
-
-    parser.add_argument(
-        "--compare-models",
-        action="store_true",
-        help="also fit each camera as other models, compare them by pictures left out of the fit, and name "
-        "the one that earns its parameters",
-    )
-
-
-def _model_kind(text: str) -> str:
-    """Return a camera model's name as files have it; argparse tells the refusal."""
-    from calib.geometry.cahvor import KINDS
-
-    if text.upper() not in KINDS:
-        known = ", ".join(kind.lower() for kind in KINDS)
-        raise argparse.ArgumentTypeError(f"'{text}' is not a camera model; known are {known}")
-    return text.upper()
-
-
 def check_file(path: Path, option: str) -> None:
-    """Refuse a file that cannot be written, by what is there now."""
+    """Refuse a file that cannot be written. Raises CommandError."""
     try:
         target = path.resolve()
         if not target.parent.is_dir():
@@ -258,7 +266,7 @@ def check_file(path: Path, option: str) -> None:
 
 
 def check_folder(path: Path | None, option: str) -> None:
-    """Refuse a folder that cannot be made or written to; None is no folder."""
+    """Refuse a folder that cannot be made or written to; None is no folder. Raises CommandError."""
     if path is None:
         return
     try:
@@ -273,7 +281,7 @@ def check_folder(path: Path | None, option: str) -> None:
 
 
 def _try_to_write(folder: Path, what: str) -> None:
-    """Write a nameless file there: permissions alone do not tell (read-only disks, root)."""
+    """Write a nameless file there: permissions alone do not show it (read-only disks, root)."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass

@@ -1,70 +1,31 @@
-"""``mastctl sentinel``: reference pictures, looked at again, and what has changed since."""
+"""``mastctl rig sentinel``: reference pictures, taken again and again, and what has changed since."""
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
-from mastctl.cli.output import angle_rad, positive_number
-from mastctl.cli.service import add_daemon_options, client_of, tell_result
+from mastctl.cli.daemon import DAEMON, client_of
+from mastctl.cli.options import GROUPS, angle_rad, command, option
+from mastctl.cli.output import Answer, CommandError
 
 if TYPE_CHECKING:
     from mastctl.client import Client
 
 NAME = "sentinel"
+FOLDER = option("--folder DIR", "the folder of references and results", required=True)
 
-
-def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add sentinel."""
-    sentinel = subparsers.add_parser(
-        "sentinel",
-        help="notice a bumped camera, a slipped joint, a lens refocused",
-        description="Keeps images of a few poses of the head, takes them again, reports a change.",
-    )
-    acts = sentinel.add_subparsers(dest="act", required=True, metavar="ACT")
-    reference = acts.add_parser("reference", help="take the pictures that later looks are compared with")
-    reference.add_argument(
-        "--pose", action="append", type=_pose, metavar="PAN,TILT", help="a pose, radians (default: six)"
-    )
-    reference.set_defaults(run=_reference)
-    look = acts.add_parser("look", help="take them again and report changes; 1 if there is one")
-    look.set_defaults(run=_look)
-    watch = acts.add_parser("watch", help="look again and again, whenever the head is idle, until Ctrl-C")
-    watch.add_argument(
-        "--every-s",
-        type=positive_number,
-        default=86400.0,
-        metavar="S",
-        help="how often, from the reference's time of day on (default: once a day)",
-    )
-    watch.add_argument(
-        "--idle-s",
-        type=positive_number,
-        default=300.0,
-        metavar="S",
-        help="how long the head must have been idle (default 300 s)",
-    )
-    watch.set_defaults(run=_watch)
-    status = acts.add_parser("status", help="the result of the looks so far; 1 if something has changed")
-    status.set_defaults(run=_status)
-    for one in (reference, look, watch, status):
-        one.add_argument(
-            "--folder", type=Path, required=True, metavar="DIR", help="where pictures and looks are"
-        )
-    for one in (reference, look, watch):
-        add_daemon_options(one)
+GROUPS["rig sentinel"] = "notice a bumped camera, a slipped joint, a lens refocused"
 
 
 def _pose(text: str) -> tuple[float, float]:
-    words = text.split(",")
-    if len(words) != 2:
+    angles = text.split(",")
+    if len(angles) != 2:
         raise argparse.ArgumentTypeError(f"'{text}' where PAN,TILT in radians is expected")
-    return angle_rad(words[0]), angle_rad(words[1])
+    return angle_rad(angles[0]), angle_rad(angles[1])
 
 
 @contextmanager
@@ -77,7 +38,15 @@ def _steering(args: argparse.Namespace, client: Client) -> Iterator[None]:
         yield
 
 
-def _reference(args: argparse.Namespace) -> int:
+@command(
+    "rig sentinel reference",
+    option("--pose PAN,TILT", "a pose, radians (default: six)", type=_pose, repeat=True),
+    FOLDER,
+    *DAEMON,
+    help="take the reference pictures",
+    example="--folder sentinel --pose 0,-0.3",
+)
+def _reference(args: argparse.Namespace) -> Answer:
     from mastctl.watch.looks import head_cameras, now_utc, take_pictures, usual_rests
     from mastctl.watch.reference import save_reference
 
@@ -85,25 +54,28 @@ def _reference(args: argparse.Namespace) -> int:
         rests = args.pose or usual_rests(client)
         _, cameras = head_cameras(client)
         if not cameras:
-            raise output.CommandError("no_camera", "the daemon has no camera on the head")
+            raise CommandError("no_camera", "the daemon has no camera on the head")
         with output.waiting(args.json, f"taking images at {len(rests)} poses"):
             taken = take_pictures(client, rests, cameras)
     if taken.missing:
         which, why = next(iter(taken.missing.items()))
-        raise output.CommandError("no_picture", f"no reference was taken: {which}: {why}")
+        raise CommandError("no_picture", f"no reference was taken: {which}: {why}")
     saved = save_reference(args.folder, now_utc().isoformat(timespec="seconds"), rests, taken.pictures)
     counts = f"{len(saved.pictures)} images at {len(rests)} poses"
-    words = f"{args.folder}: {counts}, mast file {saved.mast_digest[:12]}"
-    result = {
-        "folder": str(args.folder),
-        "pictures": len(saved.pictures),
-        "rests": [list(rest) for rest in rests],
-    }
-    tell_result(args, result, words)
-    return 0
+    document = {
+        "folder": str(args.folder), "pictures": len(saved.pictures), "rests": [list(rest) for rest in rests]
+    }  # fmt: skip
+    return Answer(document, f"{args.folder}: {counts}, mast file {saved.mast_digest[:12]}")
 
 
-def _look(args: argparse.Namespace) -> int:
+@command(
+    "rig sentinel look",
+    FOLDER,
+    *DAEMON,
+    help="take them again and report changes; 1 if there is one",
+    example="--folder sentinel",
+)
+def _look(args: argparse.Namespace) -> Answer:
     from mastctl.watch.looks import look_again, now_utc
     from mastctl.watch.reference import add_look, read_reference
 
@@ -111,44 +83,50 @@ def _look(args: argparse.Namespace) -> int:
     with (
         client_of(args) as client,
         _steering(args, client),
-        output.waiting(args.json, f"looking at {len(reference.rests)} poses"),
+        output.waiting(args.json, f"comparing {len(reference.rests)} poses"),
     ):
         drift = look_again(client, reference)
-    return _tell(args, add_look(args.folder, reference, now_utc().isoformat(timespec="seconds"), drift))
+    return _standing(args, add_look(args.folder, reference, now_utc().isoformat(timespec="seconds"), drift))
 
 
-def _tell(args: argparse.Namespace, look: dict[str, Any] | None) -> int:
+def _standing(args: argparse.Namespace, look: dict[str, Any] | None) -> Answer:
     from mastctl.watch.looks import now_utc
     from mastctl.watch.reference import read_looks, read_reference
     from mastctl.watch.sentinel import standing
 
     reference = read_reference(args.folder)
     now = standing(reference, read_looks(args.folder, reference), now_utc())
-    result = {name: now[name] for name in ("level", "sentence", "since", "looks")} | {"look": look}
-    tell_result(args, result, now["sentence"])
-    for which, why in (look or {}).get("missing", {}).items():
-        output.tell(f"{which}: no picture: {why}")
-    return 1 if now["level"] == "bad" else 0
+    document = {name: now[name] for name in ("level", "sentence", "since", "looks")} | {"look": look}
+    missing = [f"{which}: no picture: {why}" for which, why in (look or {}).get("missing", {}).items()]
+    return Answer(document, [now["sentence"], *missing], 1 if now["level"] == "bad" else 0)
 
 
+@command(
+    "rig sentinel watch",
+    option(
+        "--every-s S", "how often, from the reference's time of day on (default: once a day)", default=86400.0
+    ),
+    option("--idle-s S", "how long the head must have been idle", default=300.0),
+    FOLDER,
+    *DAEMON,
+    help="look again and again, whenever the head is idle, until Ctrl-C",
+    example="--folder sentinel --every-s 86400",
+)
 def _watch(args: argparse.Namespace) -> int:
     from mastctl.watch.looks import watch
 
-    watch(
-        args.folder,
-        lambda: client_of(args),
-        output.tell,
-        lambda look: _flush(_tell(args, look)),
-        args.every_s,
-        args.idle_s,
-    )
+    def report(look: dict[str, Any]) -> None:
+        output.show(args, _standing(args, look))
+
+    watch(args.folder, lambda: client_of(args), output.tell, report, args.every_s, args.idle_s)
     return 0
 
 
-def _flush(_code: int) -> None:
-    """What a look found is to be read at once, also through a pipe."""
-    sys.stdout.flush()
-
-
-def _status(args: argparse.Namespace) -> int:
-    return _tell(args, None)
+@command(
+    "rig sentinel status",
+    FOLDER,
+    help="the result of the looks so far; 1 if something has changed",
+    example="--folder sentinel",
+)
+def _status(args: argparse.Namespace) -> Answer:
+    return _standing(args, None)

@@ -1,100 +1,40 @@
-"""Commands of the service: the daemon itself, and its clients."""
+"""Commands of the service: the daemon itself, what it knows and does, and a picture of it."""
 
 from __future__ import annotations
 
 import argparse
-import atexit
-import getpass
+import json
 import logging
-import os
+import math
 import signal
-import socket
-import sys
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl import signals
 from mastctl.cli import output
-from mastctl.cli.output import CommandError, WrongUse, finite_number, positive_number
-from mastctl.cli.target import add_target_options, check_done, check_target, option_number, target_of
+from mastctl.cli.daemon import DAEMON, client_of, followed, queue_output
+from mastctl.cli.options import command, one_of, option
+from mastctl.cli.output import Answer, CommandError, Shown, WrongUse
 from mastctl.logs import QueuedHandler
 
 if TYPE_CHECKING:
     from mastctl.client import Client
-    from mastctl.client.answers import ControlTold, LeaseGranted, OperationTold, Status, StepTold
+    from mastctl.client.answers import (
+        ControlTold,
+        Event,
+        LeaseGranted,
+        OperationListed,
+        OperationTold,
+        Status,
+        TrackTold,
+    )
     from mastctl.config import Config, Listen
 
-LOOK_S = 0.1  # how often `status --wait` asks
+POLL_S = 0.1  # how often `status --wait` requests the status
 SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
-
-
-def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add run, status, point and snapshot."""
-    run = subparsers.add_parser(
-        "run", help="run the daemon; its address is one line on stdout when it is ready"
-    )
-    run.add_argument("--config", metavar="FILE", help="configuration (default: the packaged simulated rover)")
-    run.add_argument(
-        "--log-format",
-        choices=("text", "json"),
-        help="of what it says on stderr (default: text, JSON where that goes to journald)",
-    )
-    run.add_argument("-v", "--verbose", action="store_true", help="say what the drivers meet, too")
-    run.add_argument("-q", "--quiet", action="store_true", help="say only what is wrong")
-    run.add_argument(
-        "--listen",
-        type=_address,
-        metavar="ADDRESS",
-        help="HOST:PORT or the path of a Unix socket, instead of the configuration's",
-    )
-    run.set_defaults(run=_run)
-
-    status = subparsers.add_parser("status", help="show what a running daemon knows")
-    status.add_argument(
-        "--wait", type=positive_number, metavar="S",
-        help="wait so long for a daemon that carries out commands; exit 1 if there is none by then",
-    )  # fmt: skip
-    status.set_defaults(run=_status)
-
-    point = subparsers.add_parser("point", help="point a camera at something and measure the residual")
-    what = add_target_options(point, "a point, metres")
-    what.add_argument(
-        "--angles", nargs=2, type=output.angle_rad, metavar=("PAN", "TILT"), help="joint angles, radians"
-    )
-    point.add_argument("--aim", nargs=3, metavar=("CAMERA", "X", "Y"), help="where the target shall come")
-    far = point.add_mutually_exclusive_group()
-    far.add_argument("--range", type=positive_number, metavar="M", help="how far what the pixel shows is")
-    far.add_argument("--ground", type=finite_number, metavar="Z", help="it lies level at this z, rover frame")
-    far.add_argument(
-        "--plane", nargs=6, type=finite_number, metavar=("X", "Y", "Z", "NX", "NY", "NZ"),
-        help="or in the plane through a point at right angles to a direction, rover frame",
-    )  # fmt: skip
-    point.add_argument("--pointings", type=int, choices=(1, 2), help="how often to point (default 1)")
-    point.add_argument("--no-wait", action="store_true", help="print the operation's id and do not wait")
-    point.add_argument(
-        "--timeout", type=positive_number, default=120.0, metavar="S", help="how long to wait (default 120 s)"
-    )
-    point.set_defaults(run=_point)
-
-    snapshot = subparsers.add_parser("snapshot", help="take a picture and write it to a file")
-    snapshot.add_argument("camera", metavar="CAMERA", help="camera of the configuration")
-    snapshot.add_argument("--out", required=True, metavar="FILE", help="where to: .png (lossless), .jpg")
-    snapshot.add_argument("--frame-id", metavar="ID", help="a frame that the daemon still keeps")
-    snapshot.set_defaults(run=_snapshot)
-
-    for client in (status, point, snapshot):
-        add_daemon_options(client)
-
-
-def add_daemon_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options that say which daemon is meant; `client_of` reads them."""
-    parser.add_argument("--url", help="the daemon's address (default: that of the configuration)")
-    parser.add_argument("--config", metavar="FILE", help="the configuration that the daemon runs with")
-    parser.add_argument("--lease", metavar="ID", help="the lease to steer under ('mastctl lease take')")
 
 
 def _address(text: str) -> Listen:
@@ -107,27 +47,21 @@ def _address(text: str) -> Listen:
         raise argparse.ArgumentTypeError(str(error)) from None
 
 
+@command(
+    "run",
+    option("--config FILE", "configuration (default: the packaged simulated rover)"),
+    option("--log-format text|json", "of stderr (default: text, JSON where that goes to journald)"),
+    option("-v,--verbose", "log what the drivers meet, too"),
+    option("-q,--quiet", "log only what is wrong"),
+    option("--listen ADDRESS", "HOST:PORT or path of a Unix socket, not the configuration's", type=_address),
+    example="--config rover.yaml",
+)
 def _run(args: argparse.Namespace) -> int:
     queue_output()
-    # Told to end before it is up, it ends: nothing has moved yet. Before the imports, which take a second.
+    # A signal before it is up ends it: nothing has moved yet. Before the imports, which take a second.
     with suppress(KeyboardInterrupt), signals.raised(signal.SIGINT):
         _serve(args)
     return 0
-
-
-def queue_output() -> None:
-    """Let nothing that the daemon says wait for who reads it, on stderr as on stdout."""
-    from mastctl.logs import QueuedText, writer_to
-
-    for name in ("stdout", "stderr"):
-        try:
-            descriptor = getattr(sys, name).fileno()
-        except OSError:  # a stream of a test, which does not wait
-            continue
-        writer = writer_to(descriptor)
-        setattr(sys, name, QueuedText(writer))
-        atexit.register(writer.flush)
-    signals.write_from_background()
 
 
 def _set_log(args: argparse.Namespace) -> None:
@@ -159,25 +93,35 @@ def serve_config(config: Config, args: argparse.Namespace) -> None:
     """Run a daemon with a configuration until it is told to end; its address is a line on stdout."""
     from mastctl.daemon import run
 
-    def ready(url: str) -> None:
-        if args.json:
-            output.print_json({"url": url})
-        else:
-            sys.stdout.write(f"{url}\n")
-        sys.stdout.flush()
-
-    run(config, ready, draws_ahead=True)
+    run(config, lambda url: output.show(args, Answer({"url": url}, url)), draws_ahead=True)
 
 
-def _status(args: argparse.Namespace) -> int:
+@command(
+    "status",
+    option("--wait S", "wait for a daemon that carries out commands, or for --operation's end; else exit 1"),
+    one_of(
+        option("--operations", "show the newest operations, newest first"),
+        option("--operation ID", "show one operation with its steps and what it measured"),
+        option(
+            "--events TOPIC...", "show each change as it comes: of state, operation, ... or all", nargs="*"
+        ),
+    ),
+    option("--key KEY", "with --events: of these keys only (a device, an id)", repeat=True),
+    option("--count N", "with --events: end after so many (default: never)"),
+    *DAEMON,
+    example="--wait 30",
+)
+def _status(args: argparse.Namespace) -> Answer | int:
     with client_of(args) as client:
+        if args.events is not None:
+            return _events(args, client)
+        if args.operations:
+            return _operations(client)
+        if args.operation is not None:
+            return _operation(args, client)
         status = client.status() if args.wait is None else _ready(client, args.wait)
-    if args.json:
-        output.print_json(status)
-        return 0
-    rows = [(name, text) for name, text in _status_rows(status)]
-    output.print_table(f"mastctl at {client.url}", ("what", "now"), rows, _fault_lines(status))
-    return 0
+    rows = _status_rows(status)
+    return Answer(status, Shown(f"mastctl at {client.url}", ("what", "now"), rows, _fault_lines(status)))
 
 
 def _ready(client: Client, wait_s: float) -> Status:
@@ -192,76 +136,124 @@ def _ready(client: Client, wait_s: float) -> Status:
     until_s = time.monotonic() + wait_s
     while True:
         try:
-            status = client.status(max(until_s - time.monotonic(), LOOK_S))
+            status = client.status(max(until_s - time.monotonic(), POLL_S))
             if status["state"] in WELL:
                 return status
             reason = status.get("reason")
-            words = f"the daemon is {status['state']}{f': {reason}' if reason else ''}"
+            message = f"the daemon is {status['state']}{f': {reason}' if reason else ''}"
             if status["state"] == "stopped":
-                raise CommandError("not_ready", words)
+                raise CommandError("not_ready", message)
         except ClientError as error:
             if error.code not in PASSING:
                 raise
-            words = str(error)
+            message = str(error)
         if time.monotonic() > until_s:
-            raise CommandError("not_ready", f"not ready after {wait_s:g} s: {words}")
-        time.sleep(LOOK_S)
+            raise CommandError("not_ready", f"not ready after {wait_s:g} s: {message}")
+        time.sleep(POLL_S)
 
 
-def _point(args: argparse.Namespace) -> int:
-    check_target(args)
-    request: dict[str, Any] = {"pointings": args.pointings, "aim": _camera_pixel(args.aim)}
-    if args.angles is not None:
-        request["pan_rad"], request["tilt_rad"] = args.angles
-    request |= _how_far(args)
-    with client_of(args) as client:
-        operation_id = client.point(**request, **target_of(args, client))
-        if args.no_wait:
-            tell_result(args, {"id": operation_id}, f"operation {operation_id}")
-            return 0
-        record = followed(client, operation_id, args)
-    check_done(record)
-    if args.json:
-        output.print_json(record)
+def _operations(client: Client) -> Answer:
+    found = client.operations()
+    rows = [(one["id"], _request(one), one["state"], _seconds(one), _residual(one)) for one in found]
+    columns = ("operation", "request", "state", "seconds", "residual, px")
+    return Answer({"operations": found}, Shown("operations", columns, rows))
+
+
+def _operation(args: argparse.Namespace, client: Client) -> Answer:
+    if args.wait is None:
+        record, code = client.operation(args.operation), 0
     else:
-        show_pointings(record)
+        record = followed(client, args.operation, args.json, args.wait)
+        code = int(record["state"] != "done")
+    shown: list[str | Shown] = [
+        f"{'✓' if step['state'] == 'done' else '✗'} {step['name']} ({step['duration_s']:.2f} s)"
+        for step in record["steps"]
+    ]
+    shown += [pointings_shown(record)] if record["pointings"] else []
+    return Answer(record, [*shown, f"{record['id']}: {_request(record)}, {_progress(record)}"], code)
+
+
+def _events(args: argparse.Namespace, client: Client) -> int:
+    lines = (
+        Answer(event, f"{event['topic']} {event['key']}: {_event_line(event)}")
+        for event in client.events(*args.events, keys=args.key)
+    )
+    return show_each(args, lines)
+
+
+def show_each(args: argparse.Namespace, answers: Iterable[Answer]) -> int:
+    """Show each answer as it comes, --count of them; they end with the daemon. Raises CommandError."""
+    for number, answer in enumerate(answers, 1):
+        output.show(args, answer)
+        if number == args.count:
+            return 0
+    if args.count is not None:
+        raise CommandError("ended", f"the daemon ended before {args.count} changes were shown")
     return 0
 
 
-def _angle(read_rad: float, true_rad: float) -> str:
-    """An angle as read, and the true one where the mast file says that it is another."""
-    truly = "" if read_rad == true_rad else f", truly {true_rad:+.6f} rad"
-    return f"{read_rad:+.6f} rad{truly}"
+def _event_line(event: Event) -> str:
+    """Return an event in a line."""
+    if event["topic"] == "state":
+        return ", ".join(filter(None, (event["value"]["state"], event["value"]["reason"])))
+    if event["topic"] == "operation":
+        return f"{_request(event['value'])}, {_progress(event['value'])}"
+    if event["topic"] == "track":
+        return track_line(event["value"])
+    if event["topic"] == "fault":
+        return "; ".join(fault["message"] for fault in event["value"]) or "nothing"
+    if event["topic"] == "joints":
+        head = event["value"]
+        moving = ", moving" if head["moving"] else ""
+        return f"pan {head['pan_rad']:+.6f}, tilt {head['tilt_rad']:+.6f} rad{moving}"
+    return json.dumps(event["value"])
 
 
-def _range(record: Mapping[str, Any]) -> str:
-    """How far the target is, and how sure that is where one camera tells it."""
-    told = f"range {record['range_m']:.3f} m"
-    if record["range_from"] not in ("parallax", "unknown"):
-        return told
-    near, far = record["range_interval_m"]
-    reach = "infinity" if far is None else f"{far:.3f} m"
-    return (
-        f"{told} by {record['range_from'].replace('unknown', 'a guess')}: 95 % from {near:.3f} m to {reach}"
-    )
+def _progress(record: OperationTold) -> str:
+    """How far an operation is."""
+    if record["error"]:
+        return f"{record['state']}: {record['error']['message']}"
+    steps = record["steps"]
+    return f"{record['state']} after {steps[-1]['name']}" if steps else str(record["state"])
 
 
-def _how_far(args: argparse.Namespace) -> dict[str, Any]:
-    """What says how far a pixel's thing is, as `Client.point` takes it. Raises WrongUse."""
-    told: dict[str, Any] = {}
-    if args.range is not None:
-        told = {"range_m": args.range}
-    elif args.ground is not None:
-        told = {"plane": {"point_m": [0.0, 0.0, args.ground]}}
-    elif args.plane is not None:
-        told = {"plane": {"point_m": args.plane[:3], "normal": args.plane[3:]}}
-    if told and args.pixel is None and args.camera is None:
-        raise WrongUse("--range, --ground and --plane go with --pixel or --camera")
-    return told
+def _request(record: OperationListed) -> str:
+    """The request of an operation in a line."""
+    request = record["request"]
+    kind = next((name for name in ("track", "jog", "look") if name in request), "point")
+    found = request.get(kind)
+    goal = found if isinstance(found, dict) else request
+    if goal.get("pixel"):
+        pixel = goal["pixel"]
+        return f"{kind} at {pixel['camera']} ({pixel['x_px']:g}, {pixel['y_px']:g})"
+    if goal.get("position_m"):
+        x, y, z = goal["position_m"]
+        return f"{kind} at ({x:g}, {y:g}, {z:g}) m"
+    if "pan_rad" in goal:
+        return f"{kind} at pan {goal['pan_rad']:g}, tilt {goal['tilt_rad']:g} rad"
+    return kind
 
 
-def _snapshot(args: argparse.Namespace) -> int:
-    out = Path(args.out)
+def _seconds(record: OperationListed) -> str:
+    begun, ended = record["started_s"], record["ended_s"]
+    return "-" if begun is None or ended is None else f"{ended - begun:.2f}"
+
+
+def _residual(record: OperationListed) -> str:
+    residual = record["residual_px"]
+    return "-" if not residual or None in residual else f"{residual[0]:+.3f}, {residual[1]:+.3f}"
+
+
+@command(
+    "snapshot",
+    option("CAMERA", "camera of the configuration"),
+    option("--out FILE", "where to: .png (lossless), .jpg", required=True),
+    option("--frame-id ID", "a frame that the daemon still keeps"),
+    *DAEMON,
+    example="navcam_left --out left.png",
+)
+def _snapshot(args: argparse.Namespace) -> Answer:
+    out = args.out
     kind = SUFFIXES.get(out.suffix.lower())
     if kind is None:
         raise WrongUse(f"--out is '{args.out}' where a name ending in {', '.join(SUFFIXES)} is expected")
@@ -272,110 +264,11 @@ def _snapshot(args: argparse.Namespace) -> int:
     except OSError as error:
         raise CommandError("file_system", f"{out}: cannot be written: {error.strerror}", 2) from None
     line = f"{out}: frame {shot.frame_id}, pan {shot.pan_rad:.6f} rad, tilt {shot.tilt_rad:.6f} rad"
-    tell_result(args, {"file": str(out), **shot.facts}, line + (", head moving" if shot.moving else ""))
-    return 0
+    return Answer({"file": str(out), **shot.facts}, line + (", head moving" if shot.moving else ""))
 
 
-def refuse_daemon_options(args: argparse.Namespace) -> None:
-    """Refuse --url and --config beside --simulated, which asks no running daemon."""
-    for option in ("url", "config", "lease"):
-        if getattr(args, option) is not None:
-            raise WrongUse(f"--{option} names a running daemon; --simulated starts rovers of its own")
-
-
-@contextmanager
-def client_of(args: argparse.Namespace, *, whatever_configured: bool = False) -> Iterator[Client]:
-    """A client of the daemon that the options, or MASTCTL_URL, name.
-
-    Where nothing names one, it is that of the packaged configuration, and a daemon of another user is only
-    read there. ``whatever_configured``: where the configuration cannot be read, the usual address is asked.
-    """
-    from calib.errors import BadFile
-    from mastctl.client import Client
-    from mastctl.config import Listen, load_config
-
-    url, reads_only = args.url or os.environ.get("MASTCTL_URL"), ""
-    if url is None:
-        named = args.config is not None
-        try:
-            listen = load_config(args.config).listen
-        except BadFile as error:
-            if not whatever_configured:
-                raise
-            listen, named = Listen(), False
-            output.tell(f"{error}; asking the usual address {listen.url}")
-        if listen.socket is None and listen.port == 0:
-            raise WrongUse("the configuration listens at any free port (0); give --url")
-        url = listen.url
-        if not named:
-            reads_only = _not_ours(listen)
-    with Client(url, name=_person(), reads_only=reads_only) as client:
-        client.use_lease(getattr(args, "lease", None))
-        yield client
-
-
-def _not_ours(listen: Listen) -> str:
-    """Why a daemon that nothing names is not commanded; empty if this user started it, or it is not there."""
-    owner = listener_of(listen.host, listen.port)
-    if owner is None or owner == os.getuid():
-        return ""
-    return (
-        f"the daemon at {listen.url} was started by {output.user_name(owner)}, not by this user; "
-        f"if it is the one that is meant, name it: --url {listen.url}"
-    )
-
-
-LISTENING = "0A"  # the state TCP_LISTEN of Linux, include/net/tcp_states.h
-
-
-def listener_of(host: str, port: int) -> int | None:
-    """Return the user id of who listens at an IPv4 address of this machine; None if nobody does (proc(5))."""
-    found = None
-    for table in (Path("/proc/net/tcp"), Path("/proc/net/tcp6")):
-        lines = table.read_text(encoding="ascii").splitlines()[1:] if table.exists() else []
-        for _, local, _, state, _, _, _, owner, *_ in map(str.split, lines):
-            address, _, number = local.partition(":")
-            if state != LISTENING or int(number, 16) != port:
-                continue
-            if address == socket.inet_aton(host)[::-1].hex().upper():
-                return int(owner)
-            if set(address) == {"0"}:  # every address of the machine
-                found = int(owner)
-    return found
-
-
-def _person() -> str:
-    """Who types: commands of one user of a machine are one party, however many processes they are."""
-    try:
-        return f"{getpass.getuser()}@{socket.gethostname()}"
-    except (OSError, KeyError):  # a user without a name
-        return f"{os.getuid()}@{socket.gethostname()}"
-
-
-def followed(client: Client, operation_id: str, args: argparse.Namespace) -> OperationTold:
-    """Wait for an operation, showing its steps to a person."""
-    if args.json:
-        return client.wait(operation_id, args.timeout)
-    from rich.console import Console
-    from rich.text import Text
-
-    console = Console(stderr=True)
-
-    def show(step: StepTold) -> None:
-        mark = "✓" if step.get("state") == "done" else "✗"
-        line = f"  {mark} {step.get('name')} ({step.get('duration_s') or 0.0:.2f} s)"
-        console.print(Text(output.one_line(line)))
-
-    try:
-        with console.status(f"operation {operation_id}"):
-            return client.wait(operation_id, args.timeout, show)
-    except KeyboardInterrupt:
-        output.tell(f"operation {operation_id} goes on; 'mastctl stop' stops it")
-        raise
-
-
-def show_pointings(record: OperationTold) -> None:
-    """A table of what was measured, and in which pictures."""
+def pointings_shown(record: OperationTold) -> Shown:
+    """Return what was measured as a table, and in which frames."""
     rows, notes = [], []
     for number, pointing in enumerate(record["pointings"], 1):
         residual = pointing.get("residual_px") or (None, None)
@@ -385,22 +278,38 @@ def show_pointings(record: OperationTold) -> None:
             for value, one_sigma in zip(residual, sigma, strict=True)
         ]
         rows.append((str(number), *measured))
-        told = [f"looked at in frame {pointing['frame_id']}"] if pointing.get("frame_id") else []
-        told += [pointing["note"]] if pointing.get("note") else []
-        notes.append(f"pointing {number}: {'; '.join(told)}")
+        parts = [f"measured in frame {pointing['frame_id']}"] if pointing.get("frame_id") else []
+        parts += [pointing["note"]] if pointing.get("note") else []
+        notes.append(f"pointing {number}: {'; '.join(parts)}")
     position_m = record["position_m"]
     if position_m is not None:
         x, y, z = position_m
         notes.append(f"target at ({x:.3f}, {y:.3f}, {z:.3f}) m in the rover frame")
     if record["range_m"] is not None:
         notes.append(_range(record))
-    output.print_table(
-        f"operation {record['id']}", ("pointing", "residual x, px", "residual y, px"), rows, notes
+    return Shown(f"operation {record['id']}", ("pointing", "residual x, px", "residual y, px"), rows, notes)
+
+
+def _angle(read_rad: float, true_rad: float) -> str:
+    """An angle as read, and the true one where the mast file says that it is another."""
+    truly = "" if read_rad == true_rad else f", truly {true_rad:+.6f} rad"
+    return f"{read_rad:+.6f} rad{truly}"
+
+
+def _range(record: Mapping[str, Any]) -> str:
+    """How far the target is, and within what where one camera measured it."""
+    line = f"range {record['range_m']:.3f} m"
+    if record["range_from"] not in ("parallax", "unknown"):
+        return line
+    near, far = record["range_interval_m"]
+    reach = "infinity" if far is None else f"{far:.3f} m"
+    return (
+        f"{line} by {record['range_from'].replace('unknown', 'a guess')}: 95 % from {near:.3f} m to {reach}"
     )
 
 
 def _status_rows(status: Status) -> Iterator[tuple[str, str]]:
-    """The lines of the status table."""
+    """The rows of the status."""
     reason = status.get("reason")
     yield "state", f"{status['state']} ({status['hardware']})" + (f": {reason}" if reason else "")
     if status.get("control"):
@@ -439,9 +348,9 @@ def _status_rows(status: Status) -> Iterator[tuple[str, str]]:
 
 
 def steers(control: ControlTold | LeaseGranted | None) -> str:
-    """Who steers, in a line."""
+    """Return the client that steers, in a line."""
     if control is None:
-        return "nobody steers"
+        return "no client steers"
     left_s = control["for_s"]
     until = "until what runs has ended" if left_s is None else f"for {left_s:.0f} s more"
     return f"{control['holder']} steers, {until}"
@@ -454,16 +363,23 @@ def _fault_lines(status: Status) -> list[str]:
     ]
 
 
-def _camera_pixel(words: list[str] | None) -> tuple[str, float, float] | None:
-    """``CAMERA X Y`` of --aim."""
-    if words is None:
-        return None
-    return words[0], option_number("--aim", words[1]), option_number("--aim", words[2])
-
-
-def tell_result(args: argparse.Namespace, document: Mapping[str, Any], line: str) -> None:
-    """One JSON document for programs, or one line for people, on stdout."""
-    if args.json:
-        output.print_json(document)
-    else:
-        sys.stdout.write(output.one_line(line) + "\n")
+def track_line(track: TrackTold) -> str:
+    """Return a track in one line."""
+    parts: list[str] = [track["state"]]
+    if track["pair"]:
+        parts.append(f"by {track['pair']}")
+        if not track["predicted"]:
+            parts.append(f"{track['range_m']:.3f} m away")
+    if track["position_m"]:
+        x, y, z = track["position_m"]
+        parts.append(f"at ({x:.3f}, {y:.3f}, {z:.3f}) m")
+        if track["covariance_m2"]:
+            variance = sum(track["covariance_m2"][axis][axis] for axis in range(3))
+            parts[-1] += f" ± {math.sqrt(variance):.3f} m"
+    if track["predicted"]:
+        parts.append("predicted")
+    if track["operation"]:
+        parts.append("measuring")
+    if track["reason"]:
+        parts.append(track["reason"])
+    return ", ".join(parts)

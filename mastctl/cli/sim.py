@@ -1,4 +1,4 @@
-"""Simulated servos behind real bytes, for any driver: `mastctl sim dynamixel|feetech|ptu`.
+"""Simulation for any driver: simulated servos behind real bytes, `mastctl rig sim dynamixel|feetech|ptu`.
 
 Each runs until SIGTERM, SIGINT (Ctrl-C) or, with --until-eof, the end of its standard input. JSON
 lines on standard input switch faults on and off while it runs. A terminal is never read: a job in the
@@ -15,12 +15,12 @@ import select
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from mastctl import signals
-from mastctl.cli import output, sim_new
-from mastctl.cli.output import WrongUse
+from mastctl.cli import output
+from mastctl.cli.options import GROUPS, command, one_of, option
+from mastctl.cli.output import Answer, WrongUse
 
 if TYPE_CHECKING:
     from drivers.clock import Clock
@@ -28,78 +28,42 @@ if TYPE_CHECKING:
     from drivers.sim.axis import AxisSettings
     from drivers.sim.wire.line import PtyLine, TcpLine, WireDevice
 
-_LIVE = """\
-JSON lines from a file or a pipe on standard input, one order each, answered on standard error:
-  {"word": "mute", "replies": 5}                       a fault of the head, with parameters
-  {"word": "overload", "angle_rad": 0.3, "at_s": 2}    from two seconds on
-  {"clear": true}                                      all faults off
-The faults are those of docs/drivers.md. A terminal is not read; `cat | mastctl sim ...` reads one.
-SIGTERM or Ctrl-C ends it."""
+GROUPS["rig sim"] = "simulated servos behind a serial line or a TCP port; a new simulated rover"
 
+ABOUT = """\
+{} JSON lines from a file or a pipe on standard input, answered on standard error, switch faults:
+{{"word": "mute", "replies": 5}} a fault with parameters, {{"word": "overload", "angle_rad": 0.3, "at_s": 2}}
+from two seconds on, {{"clear": true}} all off. The faults are those of docs/drivers.md. A terminal is not
+read; `cat | mastctl rig sim ...` reads one. SIGTERM or Ctrl-C ends it."""
+
+PTY = option("--pty", "a serial line as a pseudo terminal")
+SERVED = (
+    option("--link PATH", "with --pty: a stable name for the terminal"),
+    option("--faults FILE", "a fault script, which begins at once"),
+    option("--no-wire-time", "bytes take no time, and any baud rate is right"),
+    option("--verbose", "log every piece that passes on standard error"),
+    option("--until-eof", "end when standard input ends"),
+)
 
 _PAN_TILT: tuple[Literal[0], Literal[1]] = (0, 1)
 
 
-def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add sim dynamixel, sim feetech, sim ptu and sim new."""
-    sim = subparsers.add_parser(
-        "sim", help="simulated servos behind a serial line or a TCP port; a new simulated rover"
-    )
-    kinds = sim.add_subparsers(dest="kind", metavar="KIND", required=True)
-    sim_new.add_parser(kinds)
-    shape = argparse.RawDescriptionHelpFormatter
-
-    dynamixel = kinds.add_parser(
-        "dynamixel",
-        help="a bus of Dynamixel servos (protocol 2.0)",
-        epilog=_LIVE,
-        formatter_class=shape,
-    )
-    dynamixel.add_argument(
-        "--servo",
-        action="append",
-        metavar="MODEL:ID",
-        help="a servo on the bus; may be repeated: the first is pan, the second tilt "
+@command(
+    "rig sim dynamixel",
+    option(
+        "--servo MODEL:ID",
+        "a servo on the bus; may be repeated: the first is pan, the second tilt "
         "(default: xm430_w350:1 and xm430_w350:2)",
-    )
-    dynamixel.add_argument("--baud", type=int, default=57600, help="of all servos (default 57600)")
-    dynamixel.add_argument(
-        "--return-delay", type=int, default=250, metavar="N", help="in units of 2 us (default 250)"
-    )
-    dynamixel.set_defaults(run=_dynamixel)
-
-    feetech = kinds.add_parser(
-        "feetech", help="a bus of two Feetech servos, ids 1 and 2", epilog=_LIVE, formatter_class=shape
-    )
-    feetech.add_argument("--model", default="sts3215", help="of both (default sts3215)")
-    feetech.add_argument("--baud", type=int, default=1_000_000, help="of both (default 1000000)")
-    feetech.add_argument("--echo", action="store_true", help="the adapter gives back what is sent")
-    feetech.set_defaults(run=_feetech)
-
-    ptu = kinds.add_parser(
-        "ptu", help="a FLIR / Directed Perception pan/tilt unit", epilog=_LIVE, formatter_class=shape
-    )
-    ptu.add_argument("--model", default="d46_70", help="the unit (default d46_70)")
-    ptu.add_argument("--step-mode", metavar="F|H|Q|E|A", help="as delivered when left out")
-    ptu.add_argument("--baud", type=int, default=9600, help="of the serial line (default 9600)")
-    ptu.set_defaults(run=_ptu)
-
-    for kind in (dynamixel, feetech, ptu):
-        where = kind.add_mutually_exclusive_group(required=True)
-        where.add_argument("--pty", action="store_true", help="a serial line as a pseudo terminal")
-        if kind is ptu:
-            where.add_argument("--tcp", metavar="[HOST:]PORT", help="a TCP port; 0 is any free one")
-        kind.add_argument("--link", metavar="PATH", help="with --pty: a stable name for the terminal")
-        kind.add_argument("--faults", metavar="FILE", help="a fault script, which begins at once")
-        kind.add_argument(
-            "--no-wire-time", action="store_true", help="bytes take no time, and any baud rate is right"
-        )
-        kind.add_argument("--verbose", action="store_true", help="every piece that passes, on standard error")
-        kind.add_argument(
-            "--until-eof", action="store_true", help="end when standard input ends (default: go on)"
-        )
-
-
+        repeat=True,
+    ),
+    option("--baud B", "of all servos", type=int, default=57600),
+    option("--return-delay N", "in units of 2 us", type=int, default=250),
+    one_of(PTY, required=True),
+    *SERVED,
+    help="a bus of Dynamixel servos (protocol 2.0)",
+    about=ABOUT.format("A bus of Dynamixel servos (protocol 2.0)."),
+    example="--servo xl330_m288:1 --servo xl330_m288:2 --pty",
+)
 def _dynamixel(args: argparse.Namespace) -> int:
     from drivers.sim.wire.axis import WireAxis
     from drivers.sim.wire.dynamixel_bus import DynamixelBus
@@ -126,6 +90,17 @@ def _dynamixel(args: argparse.Namespace) -> int:
     return _serve(args, DynamixelBus(servos), panel, clock, facts)
 
 
+@command(
+    "rig sim feetech",
+    option("--model MODEL", "of both", default="sts3215"),
+    option("--baud B", "of both", type=int, default=1_000_000),
+    option("--echo", "the adapter gives back what is sent"),
+    one_of(PTY, required=True),
+    *SERVED,
+    help="a bus of two Feetech servos, ids 1 and 2",
+    about=ABOUT.format("A bus of two Feetech servos, ids 1 and 2."),
+    example="--pty",
+)
 def _feetech(args: argparse.Namespace) -> int:
     from drivers.errors import BadOptions
     from drivers.sim.wire.axis import WireAxis
@@ -150,6 +125,17 @@ def _feetech(args: argparse.Namespace) -> int:
     return _serve(args, FeetechBus(servos, echoes=args.echo), panel, clock, facts)
 
 
+@command(
+    "rig sim ptu",
+    option("--model MODEL", "the unit", default="d46_70"),
+    option("--step-mode MODE", "F, H, Q, E or A; as delivered when left out"),
+    option("--baud B", "of the serial line", type=int, default=9600),
+    one_of(PTY, option("--tcp [HOST:]PORT", "a TCP port; 0 is any free one"), required=True),
+    *SERVED,
+    help="a FLIR / Directed Perception pan/tilt unit",
+    about=ABOUT.format("A FLIR / Directed Perception pan/tilt unit."),
+    example="--pty",
+)
 def _ptu(args: argparse.Namespace) -> int:
     from drivers.errors import BadOptions
     from drivers.sim.wire.axis import WireAxis
@@ -200,7 +186,7 @@ def _serve(
     facts: Mapping[str, Any],
     banner: bytes = b"",
 ) -> int:
-    """Open the line, say where it is, and keep it up until told to end."""
+    """Open the line, print its address, and keep it up until a signal."""
     from drivers.faults import read_script
     from drivers.sim.wire.line import PtyLine, TcpLine
 
@@ -211,7 +197,7 @@ def _serve(
     observer = _observer(clock.now_s()) if args.verbose else None
     with _signals() as wake:
         if args.faults is not None:
-            panel.set_all(read_script(Path(args.faults)), origin=args.faults)
+            panel.set_all(read_script(args.faults), origin=str(args.faults))
         line: PtyLine | TcpLine
         if tcp is None:
             line = PtyLine(
@@ -223,11 +209,7 @@ def _serve(
             line = TcpLine(device, clock, panel, host, number, banner=banner, observer=observer)
             port = f"socket://{f'[{host}]' if ':' in host else host}:{line.port}"
         with line:
-            if args.json:
-                output.print_json({"port": port, **facts})
-            else:
-                sys.stdout.write(f"{port}\n")
-            sys.stdout.flush()
+            output.show(args, Answer({"port": port, **facts}, port))
             _follow_orders(panel, wake, args.until_eof)
     return 0
 
@@ -242,7 +224,7 @@ def _address(text: str) -> tuple[str, int]:
 
 @contextlib.contextmanager
 def _signals() -> Iterator[int]:
-    """SIGTERM and SIGINT make the descriptor that is given readable."""
+    """Give a descriptor that SIGTERM and SIGINT make readable."""
     read, write = os.pipe()
     os.set_blocking(write, False)
     before = {number: signal.signal(number, lambda *_: None) for number in (signal.SIGTERM, signal.SIGINT)}
@@ -288,7 +270,7 @@ def _follow_orders(panel: FaultPanel, wake: int, until_eof: bool) -> None:
 
 
 def _order(panel: FaultPanel, line: bytes) -> None:
-    """Switch a fault on, or faults off; what cannot be done is told and changes nothing."""
+    """Switch a fault on, or faults off; a refusal goes to stderr and changes nothing."""
     from drivers.errors import BadOptions
     from drivers.faults import PAN_TILT
 
@@ -313,7 +295,7 @@ def _order(panel: FaultPanel, line: bytes) -> None:
 
 
 def _observer(start_s: float) -> Callable[[Literal["host", "device"], bytes, float], None]:
-    """A log of what passes: seconds, who sent it, the bytes in hex and, where it is text, as text."""
+    """A log of what passes: seconds, the sender, the bytes as text or in hex."""
 
     def observe(sender: Literal["host", "device"], data: bytes, time_s: float) -> None:
         plain = all(32 <= byte < 127 or byte in b"\r\n" for byte in data)

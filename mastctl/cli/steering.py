@@ -1,258 +1,228 @@
-"""Commands that steer: ``lease``, ``jog`` and ``track``."""
+"""Commands that steer: ``point``, which also jogs, and ``track``."""
 
 from __future__ import annotations
 
 import argparse
-import math
-import sys
 import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli.output import CommandError, WrongUse, at_least, finite_number, one_line, positive_number
-from mastctl.cli.service import add_daemon_options, client_of, followed, steers, tell_result
-from mastctl.cli.target import add_target_options, check_done, check_target, target_of
+from mastctl.cli.daemon import DAEMON, TIMEOUT, client_of, followed
+from mastctl.cli.options import angle_rad, command, finite_number, one_of, option
+from mastctl.cli.output import Answer, CommandError, WrongUse
+from mastctl.cli.service import pointings_shown, show_each, track_line
 
 if TYPE_CHECKING:
     from mastctl.client import Client
-    from mastctl.client.answers import TrackTold
+    from mastctl.client.answers import OperationTold, TrackTold
+
+POLL_S = 0.05  # how often it is checked that the daemon still takes the heartbeats
+
+PIXEL = option("--pixel CAMERA FRAME_ID X Y", "a pixel of a named frame")
+CAMERA = option("--camera NAME", "a pixel (--at) of a snapshot taken now by this camera")
+POSITION = option("--position X Y Z", "a point, metres")
+AT = option("--at X Y", "the pixel, with --camera")
+FRAME = option("--frame rover|site", "frame of --position (default rover)")
 
 
-def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add lease, jog and track."""
-    for add in (_add_lease, _add_jog, _add_track):
-        add(subparsers)
-
-
-def _add_lease(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add lease."""
-    lease = subparsers.add_parser("lease", help="the lease: the right to steer the rover, and its holder")
-    acts = lease.add_subparsers(dest="act", required=True, metavar="ACT")
-    show = acts.add_parser("show", help="show who steers")
-    show.set_defaults(run=_show_lease)
-    take = acts.add_parser(
-        "take", help="acquire the lease and print its id, for --lease; with --reason from its holder"
-    )
-    take.add_argument("--name", help="the holder's name (default: user@host)")
-    take.add_argument(
-        "--reason", metavar="WHY", help="take the lease from its holder, and show the holder this reason"
-    )
-    take.set_defaults(run=_take)
-    renew = acts.add_parser("renew", help="have a lease run on from now")
-    renew.set_defaults(run=_renew)
-    for one, default_s in ((take, 30.0), (renew, None)):
-        words = "30 s" if default_s else "as long as at first"
-        one.add_argument(
-            "--for", dest="for_s", type=positive_number, default=default_s, metavar="S",
-            help=f"how long, seconds up to 3600 (default: {words})",
-        )  # fmt: skip
-    release = acts.add_parser("release", help="let others steer")
-    release.set_defaults(run=_release)
-    for one in (show, take, renew, release):
-        add_daemon_options(one)
-
-
-def _show_lease(args: argparse.Namespace) -> int:
+@command(
+    "point",
+    one_of(
+        PIXEL,
+        CAMERA,
+        POSITION,
+        option("--angles PAN TILT", "joint angles, radians", type=angle_rad),
+        option(
+            "--rates PAN TILT",
+            "jog: turn at these rates, rad/s, until Ctrl-C or --seconds",
+            type=finite_number,
+        ),
+        required=True,
+    ),
+    AT,
+    FRAME,
+    option("--aim CAMERA X Y", "where the target shall come"),
+    one_of(
+        option("--range M", "the distance of what the pixel shows"),
+        option("--ground Z", "it lies level at this z, rover frame"),
+        option(
+            "--plane X Y Z NX NY NZ",
+            "or in the plane through a point at right angles to a direction, rover frame",
+            type=finite_number,
+        ),
+    ),
+    option("--pointings 1|2", "how often to point (default 1)", type=int, choices=(1, 2)),
+    option("--no-wait", "print the operation's id and do not wait"),
+    option("--seconds S", "with --rates: for how long"),
+    TIMEOUT,
+    *DAEMON,
+    example="--camera navcam_left --at 300 420",
+)
+def _point(args: argparse.Namespace) -> Answer:
+    _check_target(args)
+    if args.rates is not None:
+        return _jog(args)
+    request: dict[str, Any] = {"pointings": args.pointings, "aim": None}
+    if args.aim is not None:
+        request["aim"] = (args.aim[0], *_pixel("--aim", args.aim[1:]))
+    if args.angles is not None:
+        request["pan_rad"], request["tilt_rad"] = args.angles
+    if args.range is not None:
+        request["range_m"] = args.range
+    elif args.ground is not None:
+        request["plane"] = {"point_m": [0.0, 0.0, args.ground]}
+    elif args.plane is not None:
+        request["plane"] = {"point_m": args.plane[:3], "normal": args.plane[3:]}
     with client_of(args) as client:
-        control = client.control()
-    tell_result(args, {"control": control}, steers(control))
-    return 0
+        operation_id = client.point(**request, **_target(args, client))
+        if args.no_wait:
+            return Answer({"id": operation_id}, f"operation {operation_id}")
+        record = followed(client, operation_id, args.json, args.timeout)
+    _check_done(record)
+    return Answer(record, pointings_shown(record))
 
 
-def _take(args: argparse.Namespace) -> int:
-    with client_of(args) as client:
-        granted = client.acquire_lease(args.name, args.for_s, args.reason)
-    tell_result(args, granted, granted["lease_id"])
-    return 0
+def _check_target(args: argparse.Namespace) -> None:
+    """Refuse options that do not go together, before any daemon gets a request. Raises WrongUse."""
+    if (args.camera is None) != (args.at is None):
+        raise WrongUse("--camera and --at go together")
+    if args.frame is not None and args.position is None:
+        raise WrongUse("--frame goes with --position")
+    far = any(getattr(args, name, None) is not None for name in ("range", "ground", "plane"))
+    if far and args.pixel is None and args.camera is None:
+        raise WrongUse("--range, --ground and --plane go with --pixel or --camera")
+    if getattr(args, "seconds", None) is not None and args.rates is None:
+        raise WrongUse("--seconds goes with --rates")
 
 
-def _renew(args: argparse.Namespace) -> int:
-    _check_named(args)
-    with client_of(args) as client:
-        granted = client.renew_lease(args.for_s)
-    tell_result(args, granted, steers(granted))
-    return 0
+def _target(args: argparse.Namespace, client: Client) -> dict[str, Any]:
+    """The target as `Client.point` and `Client.start_track` take it; empty if the options name none."""
+    if args.pixel is not None:
+        camera, frame_id, *pixel = args.pixel
+        return {"pixel": (camera, frame_id, *_pixel("--pixel", pixel))}
+    if args.camera is not None:
+        return {"pixel": (args.camera, client.snapshot(args.camera).frame_id, *args.at)}
+    return {} if args.position is None else {"position_m": args.position, "frame": args.frame}
 
 
-def _release(args: argparse.Namespace) -> int:
-    _check_named(args)
-    with client_of(args) as client:
-        client.release_lease()
-    tell_result(args, {"released": True}, "released")
-    return 0
+def _pixel(option: str, texts: list[str]) -> list[float]:
+    """The numbers of an option that begins with names. Raises WrongUse."""
+    try:
+        return [finite_number(text) for text in texts]
+    except argparse.ArgumentTypeError as error:
+        raise WrongUse(f"{option}: {error}") from None
 
 
-def _check_named(args: argparse.Namespace) -> None:
-    if args.lease is None:
-        raise WrongUse("--lease is missing; the id that 'mastctl lease take' printed is expected")
+def _check_done(record: OperationTold) -> None:
+    """Pass an operation that ended as done. Raises CommandError with the operation's error."""
+    if record["state"] == "done":
+        return
+    message = f"operation {record['id']} ended as {record['state']}"
+    error = record["error"] or {"code": record["state"], "message": message}
+    raise CommandError(error["code"], error["message"], detail={"operation": record})
 
 
-LOOK_S = 0.05  # how often it is seen whether the daemon still takes the heartbeats
-
-
-def _add_jog(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add jog."""
-    jog = subparsers.add_parser("jog", help="turn the head at a rate, until Ctrl-C or for some seconds")
-    jog.add_argument(
-        "--rates", nargs=2, type=finite_number, required=True, metavar=("PAN", "TILT"), help="rad/s"
-    )
-    jog.add_argument(
-        "--seconds", type=positive_number, metavar="S", help="for how long (default: until Ctrl-C)"
-    )
-    jog.set_defaults(run=_jog)
-    add_daemon_options(jog)
-
-
-def _jog(args: argparse.Namespace) -> int:
-    held: dict[str, str] = {}
+def _jog(args: argparse.Namespace) -> Answer:
+    stopped_by: dict[str, str] = {}
     with client_of(args) as client:
         until_s = None if args.seconds is None else time.monotonic() + args.seconds
         with suppress(KeyboardInterrupt), client.jog() as jog:
             jog.rates(*args.rates)
             while until_s is None or time.monotonic() < until_s:
-                time.sleep(LOOK_S)
+                time.sleep(POLL_S)
                 jog.check()
-                held = jog.held
+                stopped_by = jog.held
         joints = client.status()["joints"]
-    where = {name: None if joints is None else joints[name] for name in ("pan_rad", "tilt_rad")}
-    words = (
-        f"let go at pan {where['pan_rad']:+.4f}, tilt {where['tilt_rad']:+.4f} rad" if joints else "let go"
-    )
-    tell_result(args, {**where, "held": held}, "; ".join([words, *held.values()]))
-    return 0
+    ended = {name: None if joints is None else joints[name] for name in ("pan_rad", "tilt_rad")}
+    where = f" at pan {ended['pan_rad']:+.4f}, tilt {ended['tilt_rad']:+.4f} rad" if joints else ""
+    return Answer({**ended, "held": stopped_by}, "; ".join([f"released{where}", *stopped_by.values()]))
 
 
-def _add_track(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add track with its commands."""
-    track = subparsers.add_parser("track", help="follow a target while the rover moves")
-    commands = track.add_subparsers(dest="track_command", metavar="WHAT", required=True)
-
-    start = commands.add_parser("start", help="start to follow a target")
-    add_target_options(start, "the surface seen at a point, meters")
-    start.set_defaults(run=_start)
-
-    status = commands.add_parser("status", help="show the track, and offsets found by hand-offs")
-    status.set_defaults(run=_status)
-
-    watch = commands.add_parser(
-        "watch", help="show the track now and at each change, a line each; --json: a document a line"
-    )
-    watch.add_argument("--count", type=at_least(1), metavar="N", help="end after so many (default: never)")
-    watch.set_defaults(run=_watch)
-
-    pose = commands.add_parser("pose", help="say where the rover stands; the target is looked for from there")
-    pose.add_argument(
-        "--position", nargs=3, type=finite_number, required=True, metavar=("X", "Y", "Z"),
-        help="of the rover in the site frame, metres",
-    )  # fmt: skip
-    pose.add_argument(
-        "--quaternion", nargs=4, type=finite_number, default=[1.0, 0.0, 0.0, 0.0],
-        metavar=("QW", "QX", "QY", "QZ"), help="site from rover (default: not turned)",
-    )  # fmt: skip
-    pose.add_argument(
-        "--sigma", nargs=2, type=finite_number, metavar=("M", "RAD"),
-        help="of the motion since the pose before, each axis; needed while a track runs",
-    )  # fmt: skip
-    pose.add_argument("--time", type=finite_number, metavar="S", help="by your clock, seconds")
-    pose.add_argument("--no-look", action="store_true", help="carry the track over, do not look")
-    pose.set_defaults(run=_pose)
-
-    look = commands.add_parser("look", help="look for the target once more")
-    look.set_defaults(run=_look)
-
-    stop = commands.add_parser("stop", help="end the track")
-    stop.set_defaults(run=_stop)
-
-    for waiting in (start, pose, look):
-        waiting.add_argument(
-            "--timeout",
-            type=positive_number,
-            default=120.0,
-            metavar="S",
-            help="how long to wait (default 120 s)",
-        )
-    for command in (start, status, watch, pose, look, stop):
-        add_daemon_options(command)
-
-
-def _start(args: argparse.Namespace) -> int:
-    check_target(args)
+@command(
+    "track start",
+    one_of(PIXEL, CAMERA, POSITION, required=True),
+    AT,
+    FRAME,
+    TIMEOUT,
+    *DAEMON,
+    help="start to follow a target",
+    example="--camera navcam_left --at 300 420",
+)
+def _start(args: argparse.Namespace) -> Answer:
+    _check_target(args)
     with client_of(args) as client:
-        operation_id = client.start_track(**target_of(args, client))
-        check_done(followed(client, operation_id, args))
-        return _show_track(args, client.wait_track(operation_id, args.timeout))
+        operation_id = client.start_track(**_target(args, client))
+        _check_done(followed(client, operation_id, args.json, args.timeout))
+        return _track(client.wait_track(operation_id, args.timeout))
 
 
-def _status(args: argparse.Namespace) -> int:
+@command("track status", *DAEMON, help="show the track, and offsets found by hand-offs")
+def _status(args: argparse.Namespace) -> Answer:
     with client_of(args) as client:
         track = client.track()
-        _show_track(args, track)
-        if not args.json:
-            for one in track["self_check"]["offsets"]:
-                sys.stdout.write(one_line(one["sentence"]) + "\n")
-        return 0
+    return Answer(track, [track_line(track), *(one["sentence"] for one in track["self_check"]["offsets"])])
 
 
+@command(
+    "track watch",
+    option("--count N", "end after so many (default: never)"),
+    *DAEMON,
+    help="show the track now and at each change, a line each; --json: a document a line",
+    example="--count 10",
+)
 def _watch(args: argparse.Namespace) -> int:
     with client_of(args) as client:
-        for number, track in enumerate(client.watch_track(), 1):
-            _show_track(args, track)
-            sys.stdout.flush()
-            if number == args.count:
-                return 0
-    if args.count is not None:
-        raise CommandError("ended", f"the daemon ended before the track was shown {args.count} times")
-    return 0
+        return show_each(args, map(_track, client.watch_track()))
 
 
-def _pose(args: argparse.Namespace) -> int:
+@command(
+    "track pose",
+    option("--position X Y Z", "of the rover in the site frame, metres", required=True),
+    option(
+        "--quaternion QW QX QY QZ",
+        "site from rover (default: not turned)",
+        type=finite_number,
+        default=[1.0, 0.0, 0.0, 0.0],
+    ),
+    option(
+        "--sigma M RAD",
+        "of the motion since the pose before, each axis; needed while a track runs",
+        type=finite_number,
+    ),
+    option("--time S", "by your clock, seconds", type=finite_number),
+    option("--no-look", "carry the track over, without a new measurement"),
+    TIMEOUT,
+    *DAEMON,
+    help="state the rover's pose; the target is searched from there",
+    example="--position 4.1 0.2 0 --sigma 0.02 0.009",
+)
+def _pose(args: argparse.Namespace) -> Answer:
     with client_of(args) as client:
         sigma = None if args.sigma is None else (args.sigma[0], args.sigma[1])
         answer = client.pose(
             args.position, args.quaternion, sigma=sigma, time_s=args.time, look=not args.no_look
         )
-        return _after_look(args, client, answer["operation"])
+        return _measured(args, client, answer["operation"])
 
 
-def _look(args: argparse.Namespace) -> int:
+@command("track look", TIMEOUT, *DAEMON, help="measure the target once more")
+def _look(args: argparse.Namespace) -> Answer:
     with client_of(args) as client:
-        return _after_look(args, client, client.look())
+        return _measured(args, client, client.look())
 
 
-def _stop(args: argparse.Namespace) -> int:
+@command("track stop", *DAEMON, help="end the track")
+def _stop(args: argparse.Namespace) -> Answer:
     with client_of(args) as client:
-        return _show_track(args, client.stop_track())
+        return _track(client.stop_track())
 
 
-def _after_look(args: argparse.Namespace, client: Client, operation_id: str | None) -> int:
-    """Wait for a look, if there is one, and show the track."""
+def _measured(args: argparse.Namespace, client: Client, operation_id: str | None) -> Answer:
+    """Wait for a measurement, if there is one, and return the track."""
     if operation_id is not None:
-        followed(client, operation_id, args)
-    return _show_track(args, client.wait_track(operation_id, args.timeout))
+        followed(client, operation_id, args.json, args.timeout)
+    return _track(client.wait_track(operation_id, args.timeout))
 
 
-def _show_track(args: argparse.Namespace, track: TrackTold) -> int:
-    tell_result(args, track, track_line(track))
-    return 0
-
-
-def track_line(track: TrackTold) -> str:
-    """Return a track in one line."""
-    words: list[str] = [track["state"]]
-    if track["pair"]:
-        words.append(f"by {track['pair']}")
-        if not track["predicted"]:
-            words.append(f"{track['range_m']:.3f} m away")
-    if track["position_m"]:
-        x, y, z = track["position_m"]
-        words.append(f"at ({x:.3f}, {y:.3f}, {z:.3f}) m")
-        if track["covariance_m2"]:
-            variance = sum(track["covariance_m2"][axis][axis] for axis in range(3))
-            words[-1] += f" ± {math.sqrt(variance):.3f} m"
-    if track["predicted"]:
-        words.append("predicted")
-    if track["operation"]:
-        words.append("looking")
-    if track["reason"]:
-        words.append(track["reason"])
-    return ", ".join(words)
+def _track(track: TrackTold) -> Answer:
+    return Answer(track, track_line(track))

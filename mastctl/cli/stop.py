@@ -1,4 +1,4 @@
-"""Commands that stop: ``stop``, ``estop``, its ``reset``, and ``halt``, which asks no daemon.
+"""Commands that stop: ``stop``, ``estop`` and its ``reset``.
 
 A stop works whatever else does not: with a configuration that cannot be read, and when the web side of the
 daemon does not answer, by its stop socket.
@@ -13,77 +13,82 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli.output import CommandError
-from mastctl.cli.service import add_daemon_options, client_of, tell_result
+from mastctl.cli.daemon import DAEMON, client_of
+from mastctl.cli.options import command, option
+from mastctl.cli.output import Answer, CommandError, WrongUse
 
 if TYPE_CHECKING:
     from mastctl.client import Client
 
 WITHOUT_DAEMON = (
     "if the head moves, end the program that moves it ('camera sync', 'pytest') with Ctrl-C, "
-    "or stop it with 'mastctl halt --config FILE'"
+    "or stop it with 'mastctl stop --without-daemon --config FILE'"
 )
 
 
-def add_commands(subparsers: argparse._SubParsersAction[Any]) -> None:
-    """Add stop, estop, reset and halt."""
-    stop = subparsers.add_parser("stop", help="stop the mast at once")
-    stop.set_defaults(run=_stop)
-
-    estop = subparsers.add_parser(
-        "estop", help="stop the mast at once, and let nothing move it until 'mastctl reset'"
-    )
-    estop.add_argument("--reason", metavar="WORDS", help="the reason, for the person who resets it")
-    estop.add_argument("--name", metavar="WHO", help="who stops it")
-    estop.set_defaults(run=_estop)
-
-    reset = subparsers.add_parser("reset", help="release an emergency stop; nothing moves by that")
-    reset.add_argument("--reason", required=True, metavar="WORDS", help="why it is safe to move again")
-    reset.add_argument("--name", required=True, metavar="WHO", help="who says so")
-    reset.set_defaults(run=_reset)
-
-    halt = subparsers.add_parser(
-        "halt",
-        help="stop a head whose daemon is dead: opens its servo line, says stop on it, and nothing else",
-    )
-    halt.add_argument("--config", required=True, metavar="FILE", help="the daemon's configuration")
-    halt.set_defaults(run=_halt)
-
-    for client in (stop, estop, reset):
-        add_daemon_options(client)
-
-
-def _stop(args: argparse.Namespace) -> int:
-    answer = _by_any_way(args, "stop", lambda client: client.stop())
+@command(
+    "stop",
+    option(
+        "--without-daemon",
+        "stop a head whose daemon is dead: opens the servo line of --config, stops there, and nothing else",
+    ),
+    *DAEMON,
+)
+def _stop(args: argparse.Namespace) -> Answer:
+    if args.without_daemon:
+        return _on_its_line(args)
+    answer = _by_any_path(args, "stop", lambda client: client.stop())
     operation = answer.get("operation")
-    line = f"stopped at {answer['reached']}{f', operation {operation} too' if operation else ''}"
-    tell_result(args, answer, line)
-    return 0
+    return Answer(
+        answer, f"stopped at {answer['reached']}{f', operation {operation} too' if operation else ''}"
+    )
 
 
-def _estop(args: argparse.Namespace) -> int:
-    reason, name = (" ".join((words or "").split()) for words in (args.reason, args.name))
+def _on_its_line(args: argparse.Namespace) -> Answer:
+    from drivers.open_hardware import halt_head
+    from mastctl.config import load_head
+
+    if args.config is None:
+        raise WrongUse("--config is missing; the configuration of the head is expected")
+    lines = halt_head(load_head(args.config))
+    return Answer({"halted": True, "said": lines}, "; ".join(lines))
+
+
+@command(
+    "estop",
+    option("--reason TEXT", "the reason, for the person who resets it"),
+    option("--name NAME", "the name of the person who stops it"),
+    *DAEMON,
+    example='--name Ana --reason "sparks at the mast"',
+)
+def _estop(args: argparse.Namespace) -> Answer:
+    reason, name = (" ".join((text or "").split()) for text in (args.reason, args.name))
     line = f"estop {name.replace(':', ' ')}: {reason}"
-    answer = _by_any_way(args, line, lambda client: client.estop(reason=reason or None, name=name or None))
-    words = f"stopped at {answer['reached']} and latched ({answer.get('name')}: {answer.get('reason')})"
+    answer = _by_any_path(args, line, lambda client: client.estop(reason=reason or None, name=name or None))
+    latched = f"stopped at {answer['reached']} and latched ({answer.get('name')}: {answer.get('reason')})"
     if answer.get("message"):
-        words += f"; {answer['message']}"
-    tell_result(args, answer, f"{words}; 'mastctl reset --reason ... --name ...' releases it")
-    return 0
+        latched += f"; {answer['message']}"
+    return Answer(answer, f"{latched}; 'mastctl reset --reason ... --name ...' releases it")
 
 
-def _reset(args: argparse.Namespace) -> int:
-    with client_of(args, whatever_configured=True) as client:
+@command(
+    "reset",
+    option("--reason TEXT", "why it is safe to move again", required=True),
+    option("--name NAME", "the name of the person who releases it", required=True),
+    *DAEMON,
+    example='--name Ana --reason "cable mended"',
+)
+def _reset(args: argparse.Namespace) -> Answer:
+    with client_of(args, default_address=True) as client:
         answer = client.reset(reason=args.reason, name=args.name)
     was = answer["released"]
-    tell_result(args, answer, f"released (it was latched by {was['name']}, {was['at']}: {was['reason']})")
-    return 0
+    return Answer(answer, f"released (it was latched by {was['name']}, {was['at']}: {was['reason']})")
 
 
-def _by_any_way(
-    args: argparse.Namespace, line: str, ask: Callable[[Client], Mapping[str, Any]]
+def _by_any_path(
+    args: argparse.Namespace, line: str, request: Callable[[Client], Mapping[str, Any]]
 ) -> Mapping[str, Any]:
-    """Ask by the stop socket where there is one, else over HTTP; ``reached``: the socket or address."""
+    """Stop by the stop socket where there is one, else over HTTP; ``reached``: the socket or address."""
     from mastctl.safety.stop_line import NoAnswer
     from mastctl.safety.stop_line import ask as ask_socket
 
@@ -99,15 +104,15 @@ def _by_any_way(
                 failed = str(error)
         if answer is not None or failed:
             break
-    if failed:  # one of them could not; another way would meet the same head
+    if failed:  # one of them could not; another path would meet the same head
         raise CommandError("stop_failed", failed)
     if answer is not None:
         return answer
     from mastctl.client import ClientError
 
     try:
-        with client_of(args, whatever_configured=True) as client:
-            return {**ask(client), "reached": client.url}
+        with client_of(args, default_address=True) as client:
+            return {**request(client), "reached": client.url}
     except ClientError as error:
         if error.code != "no_daemon":
             raise
@@ -116,7 +121,7 @@ def _by_any_way(
 
 
 def _sockets(args: argparse.Namespace) -> Iterator[list[Path]]:
-    """The stop sockets of the daemon that is meant; the next ones if nobody answers at the ones before."""
+    """The stop sockets of the daemon that is meant; the next ones if the ones before do not answer."""
     from calib.errors import BadFile
     from mastctl.config import load_config, load_head
     from mastctl.packaged import default_config
@@ -135,20 +140,11 @@ def _sockets(args: argparse.Namespace) -> Iterator[list[Path]]:
         else:
             yield sockets_of(None, config, loaded.listen.url)
             yield sockets_of(usual_folder(config, loaded.listen.url), None, None)
-    from drivers.hardware import head_name  # only where nobody answered yet: a stop is quick
+    from drivers.hardware import head_name  # only without an answer so far: a stop is quick
     from mastctl.safety.heads import head_folders
 
-    with contextlib.suppress(BadFile):  # whoever drives this head, by whatever configuration
+    with contextlib.suppress(BadFile):  # a daemon of this head by another configuration
         name = head_name(load_head(config))
         for folder in [] if name is None else head_folders(name):
             yield sockets_of(folder, None, None)
     yield sockets_of(None, config, None)  # or this configuration, by --listen
-
-
-def _halt(args: argparse.Namespace) -> int:
-    from drivers.open_hardware import halt_head
-    from mastctl.config import load_head
-
-    said = halt_head(load_head(args.config))
-    tell_result(args, {"halted": True, "said": said}, "; ".join(said))
-    return 0

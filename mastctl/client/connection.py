@@ -184,7 +184,9 @@ class DaemonHttp:
         exit_code = 2 if answer.status_code in _BAD_INPUT else 1
         if code in ("no_token", "wrong_token"):
             shown = "the one in MASTCTL_TOKEN is unknown to it" if self._token else "MASTCTL_TOKEN holds none"
-            message = f"the daemon at {self.url} requires a token, and {shown}: 'mastctl token new' makes one"
+            message = (
+                f"the daemon at {self.url} requires a token, and {shown}: 'mastctl rig token new' makes one"
+            )
         return ClientError(code, message, detail if isinstance(detail, dict) else None, exit_code)
 
     def _event(self, line: str) -> dict[str, Any] | None:

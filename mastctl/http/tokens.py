@@ -1,7 +1,7 @@
 """Tokens: 256 random bits each, with a name and a role; the list of them keeps digests only.
 
 The first run of a daemon that needs tokens makes one for each role, each in a file of its own beside the list
-(``admin.token``), for its user only. What ``mastctl token new`` makes is shown once and kept nowhere.
+(``admin.token``), for its user only. What ``mastctl rig token new`` makes is shown once and kept nowhere.
 """
 
 from __future__ import annotations

@@ -136,7 +136,7 @@ def write_simulated(folder: Path, plugged: Plugged, answers: RigAnswers) -> NewR
     rig = built_rig(numbers, np.random.default_rng(TWIN_SEED))
     config = f"--config {quote(str(folder / CONFIG))}"
     steps = (
-        f"mastctl doctor {config}",
+        f"mastctl rig doctor {config}",
         f"mastctl run {config}",
         f"mastctl point {config} --camera navcam_left --at 320 300",
     )
@@ -193,7 +193,7 @@ _CONFIG_WORDS = """\
 """
 _SERVO_WORDS = """\
 # Check before the first move: which servo turns which axis, its sign (sign: -1), and the limits.
-# `mastctl servo info PORT ID` shows its position: turn it by hand, with its torque off, and ask again.
+# `mastctl rig servo info PORT ID` shows its position: turn it by hand, with its torque off, and ask again.
 """
 _HEAD_WORDS = """\
 # Check before the first move: the sign of each axis (pan positive to the right, tilt up), zero_rad, and the
@@ -246,9 +246,9 @@ def _steps(folder: Path, head: ProbedHead | None, cameras: int) -> tuple[str, ..
     """The next three commands."""
     config = f"--config {quote(str(folder / CONFIG))}"
     rules = f"sudo cp {quote(str(folder / RULES))} /etc/udev/rules.d/ && sudo udevadm control --reload"
-    doctor, run = f"mastctl doctor {config}", f"mastctl run {config}"
+    doctor, run = f"mastctl rig doctor {config}", f"mastctl run {config}"
     if head is None:
-        return f"{rules} && sudo udevadm trigger", "mastctl servo scan PORT", doctor
+        return f"{rules} && sudo udevadm trigger", "mastctl rig servo scan PORT", doctor
     point = f"mastctl point {config} --angles 0.2 0.0"
     by_rule = _USB.fullmatch(head.port) or cameras
     steps = (f"{rules} && sudo udevadm trigger", doctor, run) if by_rule else (doctor, run, point)
@@ -276,9 +276,9 @@ def _readme(plugged: Plugged, steps: Sequence[str], notes: Sequence[str] = ()) -
             *(f"$ {step}" for step in steps),
             "```",
             "",
-            "`mastctl doctor` names what is missing, and the command that mends it. `mastctl run` ends with",
-            "Ctrl-C. In another terminal, `mastctl point --angles 0.2 0.0` turns the head and `mastctl stop`",
-            "stops it.",
+            "`mastctl rig doctor` names what is missing, and the command that mends it. Ctrl-C ends `mastctl",
+            "run`. In another terminal, `mastctl point --angles 0.2 0.0` turns the head,",
+            "`mastctl stop` stops it.",
             "`mastctl calibrate bench` then replaces the drawing (docs/how-to/calibrate.md).",
             *_slow(plugged),
             "After an upgrade, `mastctl schema config > schemas/config.json` renews what editors check by.",
@@ -293,7 +293,7 @@ def _slow(plugged: Plugged) -> list[str]:
         if isinstance(head, ServosOnLine) and len(head.driven) > 1 and head.bauds[0] < USUAL_BAUD:
             servo = min(head.driven.values(), key=lambda one: one.baud)
             number, line = servo.servo_id, line_words(head.port, head.driver)
-            command = f"mastctl servo set-id {line} {number} {number}"
+            command = f"mastctl rig servo set-id {line} {number} {number}"
             return [
                 "",
                 f"The servos speak {servo.baud} baud, which delays every reading. This raises one's rate:",

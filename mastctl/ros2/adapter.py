@@ -39,7 +39,7 @@ def run(
     prefix: str,
     base: str,
     ros_args: Sequence[str],
-    ready: Callable[[str], None],
+    ready: Callable[[str], object],
 ) -> None:
     """Be the adapter until an exception, a signal's KeyboardInterrupt as a rule; stops what ROS began.
 

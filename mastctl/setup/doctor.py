@@ -84,7 +84,7 @@ def next_command(config: str | None, found: Sequence[DoctorFinding]) -> str:
     named = "" if config is None else f" --config {quote(config)}"
     bad = next((finding for finding in found if finding.level == "bad"), None)
     if bad is not None:
-        return f"{bad.advice or bad.sentence}; then mastctl doctor{named}"
+        return f"{bad.advice or bad.sentence}; then mastctl rig doctor{named}"
     runs = any(one.what == "daemon" and one.sentence.startswith("one runs") for one in found)
     return f"mastctl point{named} --angles 0.2 0.0" if runs else f"mastctl run{named}"
 
@@ -93,12 +93,12 @@ def _sentinel(folder: Path) -> Iterator[DoctorFinding]:
     """What the drift sentinel's looks say, where it keeps them in the state folder."""
     reference, looks, wrong = read_folder(folder)
     if wrong:
-        yield DoctorFinding("drift", "unsure", wrong, "take a new reference: mastctl sentinel reference")
+        yield DoctorFinding("drift", "unsure", wrong, "take a new reference: mastctl rig sentinel reference")
     if reference is None:
         return
     now = standing(reference, looks, datetime.now(UTC))
     good = now["level"] == "good"
-    advice = "" if good else "look again: mastctl sentinel look; if it stays, calibrate again"
+    advice = "" if good else "repeat mastctl rig sentinel look; if it stays, calibrate again"
     level: Level = "good" if good else "unsure"  # the daemon works all the same
     yield DoctorFinding("drift", level, now["sentence"], advice)
 
@@ -164,14 +164,14 @@ def _head_options(head: DeviceSettings, driver: Driver, port: str) -> Iterator[D
         return
     words = f"driver {head.driver}, {read.baud} baud"
     if isinstance(driver.bench, UnitBench):
-        words += f"; 'mastctl ptu info {quote(read.port)} --baud {read.baud}' queries it"
+        words += f"; 'mastctl rig ptu info {quote(read.port)} --baud {read.baud}' queries it"
     yield DoctorFinding("head", "good", words)
     if not isinstance(driver.bench, ServoBench):
         return
     ids, line = (read.pan.servo_id, read.tilt.servo_id), line_words(port, head.driver)
-    words = f"pan is servo {ids[0]} and tilt servo {ids[1]}; 'mastctl servo scan {line}' shows which answer"
+    words = f"pan is servo {ids[0]} and tilt servo {ids[1]}; 'mastctl rig servo scan {line}' lists them"
     new = next((number for number in ids if number != 1), 2)
-    advice = f"a new servo has the id 1: connect it alone, then mastctl servo set-id {line} 1 {new}"
+    advice = f"a new servo has the id 1: connect it alone, then mastctl rig servo set-id {line} 1 {new}"
     yield DoctorFinding("servos", "good", words, advice)
 
 

@@ -55,7 +55,7 @@ class RigNumbers:
     Raises
     ------
     BadRig
-        With the option of ``mastctl sim new`` that is out of bounds.
+        With the option of ``mastctl rig sim new`` that is out of bounds.
     """
 
     height_m: float = 1.5

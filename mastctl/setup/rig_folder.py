@@ -91,7 +91,7 @@ def write_built(
         "parameters": list(known.names),
         "covariance": rounded_matrix(known.covariance),
     }
-    source = {"kind": "made by mastctl sim new from numbers", "seed": seed}
+    source = {"kind": "made by mastctl rig sim new from numbers", "seed": seed}
     believed = replace(rig, fit=fit, provenance=source)
     folder.mkdir(parents=True, exist_ok=True)
     save_rig(believed, folder / MAST)

@@ -169,7 +169,7 @@ def read_reference(folder: Path) -> Reference:
     """
     path = folder / REFERENCE
     if not path.is_file():
-        raise BadFile(folder, "", "holds no reference; take one: mastctl sentinel reference")
+        raise BadFile(folder, "", "holds no reference; take one: mastctl rig sentinel reference")
     try:
         document = json.loads(read_bytes(path, MOST_BYTES))
     except (ValueError, RecursionError):

@@ -30,7 +30,7 @@ import numpy as np
 import yaml
 
 from hil_tests.support.living_daemon import simulated, started
-from mastctl.cli.output import at_least
+from mastctl.cli.options import at_least
 from mastctl.client import Client, ClientError
 from mastctl.packaged import default_config
 from mastctl.safety.stop_line import ask

@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 
 from calib.geometry.cahvor import CameraModel
-from mastctl.cli.output import at_least
+from mastctl.cli.options import at_least
 from tools.command import end, options, show
 
 TASKS = ("forward", "gradient", "inverse")

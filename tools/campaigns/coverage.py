@@ -51,9 +51,10 @@ from hil_tests.support.sim_survey.noise import with_uneven_noise
 from hil_tests.support.sim_survey.plan import SurveyPlan, SurveyTruth
 from hil_tests.support.sim_survey.survey import simulate_survey
 from mastctl.calibration.run import FITS, Method
-from mastctl.cli.output import at_least, not_negative
+from mastctl.cli.options import at_least, not_negative
+from mastctl.cli.tasks import results_of
 from mastctl.packaged import config_folder
-from tools.command import end, held_percent, options, rms, run_cases
+from tools.command import end, held_percent, options, rms
 
 Z = 1.959964
 """95 % of a normal distribution lie within so many sigmas."""
@@ -359,10 +360,10 @@ def main(words: Sequence[str] | None = None) -> int:
             true = replace(true, mast=skew)
         plan = SurveyPlan(sigma=Sigma(0.001, 0.1, 0.0, args.prism_cad_sigma_m))
         surveys = [SurveyTask(true, seed, plan, args.method, args.mast, args.gross) for seed in seeds]
-        found = run_cases(args, "surveys", survey_score, surveys, "seed {0.seed}".format)
+        found = results_of(args, "surveys", survey_score, surveys, "seed {0.seed}".format)
     else:
         benches = [BenchTask(plan_of(args.head, args.attitudes, seed, args.checks), seed) for seed in seeds]
-        found = run_cases(args, "benches", bench_score, benches, "seed {0.seed}".format)
+        found = results_of(args, "benches", bench_score, benches, "seed {0.seed}".format)
     if scores := [one for one in found if isinstance(one, Score)]:
         report(scores)
         if args.of == "survey":

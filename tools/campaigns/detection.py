@@ -23,7 +23,8 @@ from scipy.spatial.transform import Rotation
 from calib.targets.boards import AnyBoard, AprilGrid, Charuco, Checkerboard, CornersNotFound, DotBoard
 from calib.targets.corners import find_corners
 from calib.targets.pattern import pattern_of
-from tools.command import end, options, rms, run_cases, show
+from mastctl.cli.tasks import results_of
+from tools.command import end, options, rms, show
 
 FloatArray = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -407,7 +408,7 @@ def main() -> int:
         if args.kind in (None, kind)
         for pose in range(args.cases)
     ]
-    founds = run_cases(args, "poses", run_pose, tasks, lambda t: f"{t.kind}, {t.scene.name}, {t.pose}")
+    founds = results_of(args, "poses", run_pose, tasks, lambda t: f"{t.kind}, {t.scene.name}, {t.pose}")
     by_case: dict[tuple[str, str, str], list[CornersOutcome]] = {}
     for task, outcomes in zip(tasks, founds, strict=True):
         for case, outcome in outcomes.items():

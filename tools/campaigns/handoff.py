@@ -39,10 +39,11 @@ from drivers.sim.compiled import kernels
 from drivers.sim.render import compile_renderer
 from drivers.sim.rocks import make_brick, meshes, together
 from drivers.sim.scene import Scene, SceneSettings, build_scene, sun_direction
-from mastctl.cli.output import at_least
+from mastctl.cli.options import at_least
+from mastctl.cli.tasks import results_of
 from mastctl.experiment.targets import BORDER_PX, texture_mask
 from mastctl.packaged import config_folder
-from tools.command import end, options, rms, run_cases, show
+from tools.command import end, options, rms, show
 from tools.studies.approach_world import ApproachWorld, WorldErrors
 
 Float64 = NDArray[np.float64]
@@ -417,7 +418,7 @@ def main() -> int:
     ]
     label = "{0.kind}, {0.count} from {0.first}".format
     done: dict[str, list[list[HandoffOutcome]]] = {kind: [] for kind in wanted}
-    for block, cases in zip(blocks, run_cases(args, "blocks", run_block, blocks, label), strict=True):
+    for block, cases in zip(blocks, results_of(args, "blocks", run_block, blocks, label), strict=True):
         done[block.kind] += cases
     total = summary("all bad", [cases for kind in KINDS for cases in done[kind]])
     show(args, [summary(kind, cases) for kind, cases in done.items()] + [total], COLUMNS)

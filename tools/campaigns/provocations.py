@@ -60,12 +60,13 @@ from mastctl.bench.simulated import BOARD
 from mastctl.calibration.run import SurveyRefused, checked_survey
 from mastctl.calibration.verdict import judge_calibration
 from mastctl.cli.main import main as mastctl
+from mastctl.cli.tasks import results_of
 from mastctl.client import Client, Snapshot
 from mastctl.config import Listen, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.packaged import config_folder
 from tools.campaigns.provoked import PROVOCATIONS, Provoked
-from tools.command import end, heading, line, options, rms, run_cases
+from tools.command import end, heading, line, options, rms
 
 DIRECTIONS_RAD = ((-0.8, -0.2), (0.0, -0.4), (0.7, -0.7))
 RANGES_M = (2.0, 6.0, 10.0)
@@ -423,7 +424,7 @@ def surveys(args: argparse.Namespace) -> int:
     tasks = tasks_of(rig_of_pairs(RIG, PAIRS), args.cases, args.seed)
     if args.only:
         tasks = [task._replace(kind=args.only[0]) for task in tasks]
-    outcomes = run_cases(args, "surveys", judged, tasks, "seed {0.seed}, {0.kind}".format)
+    outcomes = results_of(args, "surveys", judged, tasks, "seed {0.seed}, {0.kind}".format)
     columns = ("refused", *(f"{far}: {said}" for far in FAR for said in SAID.values()))
     print(heading(("wrong", "cases", "named", *columns)))
     for kind in [*PROVOCATIONS, "all"]:
@@ -443,7 +444,7 @@ def surveys(args: argparse.Namespace) -> int:
 def benches(args: argparse.Namespace) -> int:
     """Print the table of benches."""
     names = [case.name for case in CASES if not args.only or any(part in case.name for part in args.only)]
-    rows = run_cases(args, "benches", bench_row, names)
+    rows = results_of(args, "benches", bench_row, names)
     print(heading(("provoked", "exit", "pictures kept", "message")))
     for row in rows:
         print(line(*row))

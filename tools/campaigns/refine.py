@@ -25,8 +25,9 @@ from calib.geometry.rigid import FloatArray, Rigid, moved_rigid
 from calib.matching.handed_over import MatchedHandoff, matched_handoff
 from calib.matching.handoff import RefinedPixel
 from mastctl.calibration.landing import handoff_errors_px
-from mastctl.cli.output import at_least, not_negative, positive_number
-from tools.command import end, options, rms, run_cases, show
+from mastctl.cli.options import at_least, not_negative, positive_number
+from mastctl.cli.tasks import results_of
+from tools.command import end, options, rms, show
 
 HEAD_HEIGHT_M, ASIDE_RAD = 1.45, 0.35
 HELD_OUT, HELD_OUT_M = 60, (1.5, 4.0)
@@ -188,7 +189,7 @@ def main() -> int:
     if lacking := [pair for pair in ("navcam", "hazcam") if pair not in true.stereo]:
         parser.error(f"--rig {args.rig} has no stereo pair '{lacking[0]}'")
     blocks = blocks_of(true, args)
-    found = run_cases(args, "tens of cases", run_block, blocks, label)
+    found = results_of(args, "tens of cases", run_block, blocks, label)
     rows = []
     for name, ranges_m, size in ROWS:
         row = [

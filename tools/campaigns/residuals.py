@@ -27,6 +27,7 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
 from drivers.sim.rover import RoverModel
 from drivers.simulation_clock import MAX
+from mastctl.cli.tasks import results_of
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon
@@ -34,7 +35,7 @@ from mastctl.devices.frames import camera_and_sequence
 from mastctl.experiment.simulated import own_config
 from mastctl.experiment.targets import BORDER_PX
 from mastctl.packaged import config_folder
-from tools.command import end, options, rms, run_cases, show
+from tools.command import end, options, rms, show
 
 DAYS = {"kind": "default.yaml", "worst": "worst_day.yaml"}
 GROUPS = ("rocks", "ground")
@@ -240,7 +241,7 @@ def main() -> int:
         for group in GROUPS
     ]
     label = "{0.day} day, {0.group}, scene {0.number}".format
-    found = run_cases(args, "scenes", click_all, tasks, label)
+    found = results_of(args, "scenes", click_all, tasks, label)
     rows = []
     for day, group in product(args.day, GROUPS):
         mine = [

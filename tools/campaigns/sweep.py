@@ -23,13 +23,14 @@ import numpy as np
 import yaml
 
 from drivers.simulation_clock import MAX
+from mastctl.cli.tasks import results_of
 from mastctl.client import Client
 from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.pointing import PointingExperiment, TargetRecord, run_pointing_experiment
 from mastctl.experiment.simulated import SimulationTruth
 from mastctl.packaged import config_folder
-from tools.command import end, numbers, options, rms, run_cases, show
+from tools.command import end, numbers, options, rms, show
 
 SWEEPS = Path(__file__).with_name("sweeps.yaml")
 PAIR = ("navcam_left", "navcam_right")
@@ -162,7 +163,7 @@ def main() -> int:
         for index in range(args.cases)
     ]
     label = "{0.name}, {0.distance_m:g} m, target {0.index}".format
-    found = run_cases(args, "targets", point, variants, label)
+    found = results_of(args, "targets", point, variants, label)
     rows = []
     for name in cases:
         mine = [done for variant, done in zip(variants, found, strict=True) if variant.name == name]

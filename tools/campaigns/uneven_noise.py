@@ -35,10 +35,11 @@ from hil_tests.support.sim_survey.survey import simulate_survey
 from mastctl.calibration.bench_verdict import judge_bench
 from mastctl.calibration.run import SurveyRefused, checked_survey
 from mastctl.calibration.verdict import judge_calibration
+from mastctl.cli.tasks import results_of
 from tools.campaigns.coverage import pixel_errors, plan_of
 from tools.campaigns.provocations import PAIRS, RIG, errors_in_sigmas, rig_of_pairs
 from tools.campaigns.provoked import Provoked
-from tools.command import end, heading, line, options, rms, run_cases
+from tools.command import end, heading, line, options, rms
 
 FACTORS = (1.1, 1.3, 1.5, 2.0, 3.0, 5.0)
 SUBJECTS = ("camera", "picture", "placement")
@@ -170,7 +171,7 @@ def main() -> int:
     parser.add_argument("of", choices=("noisy-survey", "noisy-bench"))
     args = parser.parse_args()
     tasks = tasks_of(args.of, args.cases, args.seed)
-    report(run_cases(args, args.of, judged, tasks, "{0.what} {0.size:g}, seed {0.seed}".format))
+    report(results_of(args, args.of, judged, tasks, "{0.what} {0.size:g}, seed {0.seed}".format))
     return 0
 
 

@@ -38,7 +38,7 @@ from drivers.sim.pan_tilt import SimulatedPanTilt
 from hil_tests.support.sim_survey.plan import Ring, SurveyPlan
 from hil_tests.support.sim_survey.survey import simulate_survey
 from mastctl.calibration.run import Calibrated, calibrate, checked_survey
-from mastctl.cli.output import at_least
+from mastctl.cli.options import at_least
 from tools.command import end
 
 SIGMA = Sigma(station_m=0.001, dot_px=0.1, joint_rad=3e-5)

@@ -24,7 +24,7 @@ from drivers.sim.scene import build_scene
 from hil_tests.support.sim_survey.board import draw_board, photograph
 from hil_tests.support.sim_survey.plan import SurveyPlan, SurveyTruth
 from hil_tests.support.sim_survey.survey import simulate_survey
-from mastctl.cli.output import at_least, not_negative
+from mastctl.cli.options import at_least, not_negative
 from tools.command import end
 
 BLUR_PX, NOISE_DN = 0.7, 2.0

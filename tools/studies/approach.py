@@ -27,10 +27,11 @@ from calib.geometry.stereo import target_approach_budget
 from calib.matching.look import seen_by
 from calib.matching.track import Track, moved_track, start_track
 from drivers.sim.scene import SceneSettings, build_scene
+from mastctl.cli.tasks import results_of
 from mastctl.experiment.targets import texture_mask
 from mastctl.motion.pairs import choose_pairs
 from mastctl.packaged import config_folder
-from tools.command import end, options, run_cases, show
+from tools.command import end, options, show
 from tools.studies.approach_world import ApproachWorld, WorldErrors
 
 START_M, END_M = 10.0, 1.0
@@ -352,7 +353,7 @@ def main(words: Sequence[str] | None = None) -> int:
     true = load_rig(config_folder() / "sim" / "rocky8.yaml").rig
     believed = load_rig(config_folder() / "masts" / "rocky8_simulated.yaml").rig
     tasks = [ApproachTask(true, believed, args.seed + index) for index in range(args.cases)]
-    runs = run_cases(
+    runs = results_of(
         args, "approaches", one_approach, tasks, "seed {0.seed}".format,
         failure=lambda run: run.error,
     )  # fmt: skip

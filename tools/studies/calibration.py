@@ -16,9 +16,10 @@ import numpy as np
 from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
-from mastctl.cli.output import at_least
+from mastctl.cli.options import at_least
+from mastctl.cli.tasks import results_of
 from mastctl.packaged import config_folder
-from tools.command import end, options, run_cases, show
+from tools.command import end, options, show
 from tools.studies.calibration_survey import (
     DISTANCES_M,
     HANDOFFS,
@@ -152,7 +153,7 @@ def main(words: Sequence[str] | None = None) -> int:
     args = parser.parse_args(words)
     rig = load_rig(config_folder() / "sim" / "rocky8.yaml").rig
     chosen = [v for v in variants() if args.study is None or v.study.startswith(tuple(args.study))]
-    outcomes = run_cases(
+    outcomes = results_of(
         args,
         "surveys",
         one_survey,

@@ -20,14 +20,15 @@ import numpy as np
 from calib.files.mast_file import load_rig
 from calib.matching.handed_over import handoff_bias
 from mastctl.cli import output
+from mastctl.cli.daemon import DAEMON, client_of, refuse_daemon_options
+from mastctl.cli.options import add_options, at_least
 from mastctl.cli.output import check_folder
-from mastctl.cli.service import add_daemon_options, client_of, refuse_daemon_options
-from mastctl.cli.tasks import refuse_task_options, run_bar
+from mastctl.cli.tasks import refuse_task_options, results_of, run_bar
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.experiment.simulated import Rover, SimulationTruth, running_rover
 from mastctl.watch.handoffs import handoff_log
-from tools.command import end, options, run_cases, show
+from tools.command import end, options, show
 from tools.studies.handoff_run import STEPS, HandoffRecord, run_handoff_experiment
 
 PAPER_WORST_PX: Mapping[str, float] = {"pancam to navcam": 2.5, "navcam to hazcam": 4.0}
@@ -117,7 +118,7 @@ def bias_sentences(records: Sequence[HandoffRecord]) -> list[str]:
 def main(words: Sequence[str] | None = None) -> int:
     """Run the experiment; 1 if no target at all was handed over."""
     parser = options(__doc__, as_json=True)
-    add_daemon_options(parser)
+    add_options(parser, *DAEMON)
     parser.add_argument(
         "--simulated", action="store_true",
         help="on the packaged simulated rover, a fresh one for each target, compared with the truth",
@@ -127,7 +128,7 @@ def main(words: Sequence[str] | None = None) -> int:
         help="with --simulated: the mast file that its daemon uses (default: the packaged one)",
     )  # fmt: skip
     parser.add_argument(
-        "--targets", type=output.at_least(1), metavar="N",
+        "--targets", type=at_least(1), metavar="N",
         default=10, help="targets of each hand-off (default 10)",
     )  # fmt: skip
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for handoffs.jsonl")
@@ -154,7 +155,7 @@ def _simulated(args: argparse.Namespace) -> list[HandoffRecord]:
     mast_file = None if args.mast_file is None else args.mast_file.read_bytes()
     rover = Rover("ptu_d46_70", args.seed, 0, mast_file)
     tasks = [HandoffTask(rover, source, index) for source in sources for index in range(args.targets)]
-    parts = run_cases(
+    parts = results_of(
         args, "hand-off", one_handoff, tasks, "from {0.source}, target {0.index}".format,
         failure=lambda part: next((record.error for record in part if record.error), ""),
     )  # fmt: skip

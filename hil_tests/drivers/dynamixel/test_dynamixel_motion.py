@@ -153,7 +153,7 @@ def test_a_position_that_leaps_is_refused() -> None:
         ({"limits_rad": [-3.2, 2.0]}, "does not cross the seam"),
         ({"approach": "positive", "approach_rad": 0.004}, "does not take up the backlash"),
         ({"model": "YM070-210-M001-RH"}, "which the Y family's are not"),
-        ({"model": "XW540-T260-R"}, "(model number 1170); mastctl servo info reads it. Needed is a row"),
+        ({"model": "XW540-T260-R"}, "(model number 1170); mastctl rig servo info reads it. Needed is a row"),
         ({"model": "MX-28", "current_limit_A": 1.0}, "has no current limit"),
         ({"current_limit_A": 3.3}, "0.00269 to 3.209 A for a XM430-W350 is expected"),
         ({"limits_rad": [0.1, 0.1012]}, "hold no two counts of a XM430-W350, whose count is 0.0015 rad"),

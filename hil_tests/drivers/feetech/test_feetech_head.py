@@ -285,7 +285,7 @@ def cli(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Bench]:
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, Any, str]:
-    code = main(["servo", *words, "--family", "feetech", "--json"])
+    code = main(["rig", "servo", *words, "--family", "feetech", "--json"])
     out, err = capsys.readouterr()
     return code, json.loads(out) if out else None, err
 
@@ -325,7 +325,7 @@ def test_a_change_of_id_that_fails_leaves_the_eeprom_locked(
     with bench() as it:
         link = open_link(it.line.path, 1_000_000, 0.05, clock=it.clock, open_line=it.line.open)
         monkeypatch.setattr(FeetechLink, "write_unanswered", lost)
-        told = "the servo is left with the id 1 or 7 at 1000000 baud: 'mastctl servo scan memory --family f"
+        told = "the servo is left with the id 1 or 7 at 1000000 baud: 'mastctl rig servo scan memory"
         with pytest.raises(WrongDevice if mishap else NoReply, match=told):
             workshop.set_id(link, 1, 7)
         link.close()

@@ -445,19 +445,19 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_homing_by_command_needs_to_be_meant(capsys: pytest.CaptureFixture[str]) -> None:
     unit = ScriptedPtu()
     with PtyLine(unit, SystemClock(), wire_time=False) as line:
-        assert main(["ptu", "home", line.path]) == 2
+        assert main(["rig", "ptu", "home", line.path]) == 2
         assert "sweeps both axes over their full range" in capsys.readouterr().err
         assert unit.heard == []
         unit.positions = {"P": 3, "T": 4}
         unit.answers["R"] = lambda command: unit.positions.update(P=0, T=0) or b"!T!T!P!P*"
-        assert main(["ptu", "home", line.path, "--sweep-full-range", "--json"]) == 0
+        assert main(["rig", "ptu", "home", line.path, "--sweep-full-range", "--json"]) == 0
         told = json.loads(capsys.readouterr().out)
         assert told["pan"]["position"] == 0 and told["tilt"]["resolution_arcsec"] == 46.285714
-        assert main(["ptu", "info", line.path]) == 0
+        assert main(["rig", "ptu", "info", line.path]) == 0
         assert "resolution arcsec" in capsys.readouterr().out
-    assert main(["ptu", "info", line.path, "--json"]) == 1
+    assert main(["rig", "ptu", "info", line.path, "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["error"]["code"] == "line_lost"
-    assert main(["ptu", "info", "/dev/null", "--baud", "1"]) == 2
+    assert main(["rig", "ptu", "info", "/dev/null", "--baud", "1"]) == 2
 
 
 def answered(opened: Bench, head: FlirPtu) -> Reading:

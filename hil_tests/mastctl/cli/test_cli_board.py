@@ -102,7 +102,7 @@ def test_a_measured_print_has_other_sizes_and_is_not_drawn_over(
     assert board.aspect == pytest.approx(0.998 / 0.996)
     capsys.readouterr()
     assert main(["board", "make", "--kind", "charuco", "--out", str(out)]) == 2
-    assert "holds a measured board" in capsys.readouterr().err
+    assert "has a measured board" in capsys.readouterr().err
     assert load_board(yaml) == board
     again = ["board", "make", "--kind", "charuco", "--out", str(out), "--json", "--measured-bar-mm", "149.4"]
     assert main(again) == 0
@@ -112,7 +112,7 @@ def test_a_measured_print_has_other_sizes_and_is_not_drawn_over(
 BAD = {
     "of another kind": (
         ["--kind", "charuco", "--tag-mm", "30"],
-        "--tag-mm says nothing of a board of kind charuco",
+        "--tag-mm is not for a board of kind charuco",
     ),
     "too large": (["--kind", "charuco", "--columns", "9", "--rows", "5"], "--square-mm 19.3 would fit"),
     "suffix": (["--kind", "dots", "--out", "board.png"], "ending in .pdf or .svg"),

@@ -1,4 +1,4 @@
-"""The command handoff: the contract's keys, refusals and exit codes, and pointing the head first."""
+"""The command handoff: the contract's keys, refusals and exit codes."""
 
 from __future__ import annotations
 
@@ -74,8 +74,6 @@ def test_a_turned_head_that_nobody_sees_with_ends_with_one(run: Any, clicked: li
     [
         (("--from", "mono", "--to", "hazcam", *HEAD), "mono"),
         (("--from", "navcam", "--to", "hazcam"), "--pan"),
-        (("--from", "navcam", "--to", "hazcam", "--point", *HEAD), "body"),
-        (("--from", "navcam", "--to", "pancam", "--point", "--to-pan", "0.2", *HEAD), "--to-pan"),
     ],
 )
 def test_wrong_use_is_one_sentence(run: Any, clicked: list[str], words: Any, expected: str) -> None:

@@ -35,24 +35,27 @@ def run(daemon: RunningDaemon, capsys: pytest.CaptureFixture[str]) -> Run:
 
 
 def test_a_lease_is_taken_used_renewed_shown_and_released(run: Run) -> None:
-    assert run("lease", "show")[1] == "nobody steers"
-    code, lease, _ = run("lease", "take", "--for", "600", "--name", "night shift")
+    assert run("rig", "lease", "show")[1] == "no client steers"
+    code, lease, _ = run("rig", "lease", "take", "--for", "600", "--name", "night shift")
     assert (code, len(lease)) == (0, 32)
-    assert run("lease", "show")[1].startswith("night shift steers, for ")
+    assert run("rig", "lease", "show")[1].startswith("night shift steers, for ")
     assert "night shift steers" in run("status")[1]
     code, out, _ = run("point", *ANGLES, "--json")
     assert (code, json.loads(out)["error"]["code"]) == (1, "leased")
     assert run("point", *ANGLES, "--lease", lease, "--json")[0] == 0
-    assert run("lease", "renew", "--lease", lease, "--for", "60")[1] == "night shift steers, for 60 s more"
-    assert run("lease", "release", "--lease", lease)[:2] == (0, "released")
-    code, out, _ = run("lease", "release", "--lease", lease, "--json")
+    assert (
+        run("rig", "lease", "renew", "--lease", lease, "--for", "60")[1]
+        == "night shift steers, for 60 s more"
+    )
+    assert run("rig", "lease", "release", "--lease", lease)[:2] == (0, "released")
+    code, out, _ = run("rig", "lease", "release", "--lease", lease, "--json")
     assert (code, json.loads(out)["error"]["code"]) == (1, "lease_over")
 
 
 def test_taking_over_needs_a_reason(run: Run, daemon: RunningDaemon) -> None:
     with Client(daemon.url, name="bench") as client, client.lease():
-        code, out, _ = run("lease", "take", "--json")
+        code, out, _ = run("rig", "lease", "take", "--json")
         assert (code, json.loads(out)["error"]["code"]) == (1, "leased")
-        code, lease, _ = run("lease", "take", "--reason", "the bench is empty")
+        code, lease, _ = run("rig", "lease", "take", "--reason", "the bench is empty")
         assert code == 0
         assert run("point", *ANGLES, "--lease", lease)[0] == 0

@@ -13,7 +13,8 @@ import pytest
 
 from calib.files.mast_file import save_rig
 from hil_tests.mastctl.service_fakes import FakeHardware, rig
-from mastctl.cli.main import EXAMPLES, _as_one_word, build_parser, main
+from mastctl.cli.main import _ordered, build_parser, main
+from mastctl.cli.options import DECLARED
 from mastctl.client import Client
 from mastctl.daemon import RunningDaemon
 
@@ -37,25 +38,32 @@ def test_operations_are_listed_shown_and_watched(
     pair: BOTH, operation: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     url = pair[0].url
-    table = said(capsys, "operations", "list", "--url", url)
+    table = said(capsys, "status", "--operations", "--url", url)
     assert operation in table and "pan 0.25" in table and "+0.250, -0.500" in table
-    shown = said(capsys, "operations", "show", operation, "--url", url)
+    shown = said(capsys, "status", "--operation", operation, "--url", url)
     assert "✓ look" in shown and "✓ measure" in shown and "done after measure" in shown
     assert (
-        json.loads(said(capsys, "operations", "watch", operation, "--url", url, "--json"))["id"] == operation
+        json.loads(said(capsys, "status", "--operation", operation, "--wait", "60", "--url", url, "--json"))[
+            "id"
+        ]
+        == operation
     )
-    line = said(capsys, "operations", "watch", "--count", "1", "--url", url)
+    line = said(capsys, "status", "--events", "operation", "--count", "1", "--url", url)
     assert line == f"operation {operation}: point at pan 0.25, tilt -0.5 rad, done after measure\n"
-    assert main(["operations", "show", "nothing", "--url", url]) == 2
+    assert main(["status", "--operation", "nothing", "--url", url]) == 2
     assert "operation nothing is not known" in capsys.readouterr().err
 
 
 def test_events_are_a_line_each(pair: BOTH, operation: str, capsys: pytest.CaptureFixture[str]) -> None:
     url = pair[0].url
-    assert said(capsys, "events", "state", "--count", "1", "--url", url) == "state machine: ready\n"
-    told = said(capsys, "events", "operation", "mast", "--count", "2", "--url", url, "--json").splitlines()
+    assert (
+        said(capsys, "status", "--events", "state", "--count", "1", "--url", url) == "state machine: ready\n"
+    )
+    told = said(
+        capsys, "status", "--events", "operation", "mast", "--count", "2", "--url", url, "--json"
+    ).splitlines()
     assert {json.loads(line)["topic"] for line in told} == {"operation", "mast"}
-    assert main(["events", "weather", "--url", url]) == 2
+    assert main(["status", "--events", "weather", "--url", url]) == 2
     assert "'weather' where some of" in capsys.readouterr().err
 
 
@@ -64,12 +72,12 @@ def test_the_mast_file_is_shown_replaced_and_put_back(
 ) -> None:
     url = ("--url", pair[0].url)
     save_rig(rig(), tmp_path / "other.yaml")
-    shown = said(capsys, "mast", "show", "--out", str(tmp_path / "copy"), *url)
+    shown = said(capsys, "rig", "mast", "show", "--out", str(tmp_path / "copy"), *url)
     assert shown.startswith("little.yaml (little")
     assert (tmp_path / "copy").read_bytes() == (tmp_path / "little.yaml").read_bytes()
-    assert said(capsys, "mast", "use", "other.yaml", *url).startswith("other.yaml (little")
-    assert ", before other.yaml" in said(capsys, "mast", "back", *url)
-    assert main(["mast", "use", "none.yaml", *url]) == 2
+    assert said(capsys, "rig", "mast", "use", "other.yaml", *url).startswith("other.yaml (little")
+    assert ", before other.yaml" in said(capsys, "rig", "mast", "back", *url)
+    assert main(["rig", "mast", "use", "none.yaml", *url]) == 2
 
 
 def leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
@@ -82,9 +90,10 @@ def leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]
 
 
 def test_the_help_of_each_command_shows_an_example_that_it_takes() -> None:
-    parser = build_parser([])
-    known = {leaf.prog: leaf for leaf in leaves(parser)}
-    assert set(EXAMPLES) == set(known)
-    for prog, example in EXAMPLES.items():
-        assert example in " ".join(known[prog].format_help().split()), prog
-        assert "run" in parser.parse_args(_as_one_word(shlex.split(example)[1:])), example
+    parser = build_parser()
+    known = {leaf.prog.removeprefix("mastctl "): leaf for leaf in leaves(parser)}
+    assert set(DECLARED) == set(known)
+    for words, command in DECLARED.items():
+        example = f"mastctl {words} {command.example}".rstrip()
+        assert f"example: {example}" in " ".join(known[words].format_help().split()), words
+        assert "run" in parser.parse_args(_ordered(shlex.split(example)[1:])[0]), example

@@ -189,9 +189,8 @@ def test_a_stop_without_a_daemon_says_what_else_stops_a_head(
     url = f"unix:{tmp_path}/none.sock"
     assert main([word, "--url", url]) == 1
     said = capsys.readouterr().err
-    assert (
-        said.startswith(f"mastctl: no daemon answers at {url}; if the head moves") and "mastctl halt" in said
-    )
+    assert said.startswith(f"mastctl: no daemon answers at {url}; if the head moves")
+    assert "mastctl stop --without-daemon" in said
     assert "starts one" not in said
 
 

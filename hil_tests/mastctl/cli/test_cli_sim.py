@@ -1,4 +1,4 @@
-"""`mastctl sim`: a line that other programs talk to, faults by script and live, a clean end."""
+"""`mastctl rig sim`: a line that other programs talk to, faults by script and live, a clean end."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mastctl.cli.main import main
 
 
 class Sim:
-    """A running `mastctl sim`."""
+    """A running `mastctl rig sim`."""
 
     def __init__(self, process: subprocess.Popen[bytes], first: str) -> None:
         self.process = process
@@ -43,7 +43,7 @@ class Sim:
 @contextmanager
 def sim(repository: Path, *words: str) -> Iterator[Sim]:
     process = forks.Popen(
-        [*forks.MASTCTL, "sim", *words],
+        [*forks.MASTCTL, "rig", "sim", *words],
         cwd=repository,
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -121,10 +121,10 @@ def test_wrong_use_is_one_line_and_exit_code_2(
 ) -> None:
     before = held()
     handler = signal.getsignal(signal.SIGTERM)
-    assert main(["sim", *words]) == 2
+    assert main(["rig", "sim", *words]) == 2
     out, log = capsys.readouterr()
     assert out == "" and message in log and log.count("\n") == 1
-    assert main(["sim", *words, "--json"]) == 2
+    assert main(["rig", "sim", *words, "--json"]) == 2
     assert message in json.loads(capsys.readouterr().out)["error"]["message"]
     assert held() <= before
     assert signal.getsignal(signal.SIGTERM) == handler

@@ -22,7 +22,7 @@ echo "${{COMPREPLY[@]}}"
 def test_a_shell_completes_commands_and_options(
     words: str, expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["completion", "bash"]) == 0
+    assert main(["--print-completion", "bash"]) == 0
     (tmp_path / "completion").write_text(capsys.readouterr().out)
     script = ASK.format(words=words, number=len(words.split()))
     asked = subprocess.run(
@@ -32,19 +32,3 @@ def test_a_shell_completes_commands_and_options(
         check=True,
     )
     assert asked.stdout.split() == [expected]
-
-
-def test_one_command_installs_it_for_a_user(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    assert main(["completion", "bash"]) == 0
-    script = capsys.readouterr().out
-    assert main(["completion", "bash", "--install"]) == 0
-    assert (tmp_path / "bash-completion/completions/mastctl").read_text() == script
-    assert main(["completion", "zsh", "--install"]) == 0
-    assert f"fpath+=({tmp_path / 'zsh/site-functions'})" in capsys.readouterr().err
-    assert main(["completion", "tcsh", "--install"]) == 2
-    monkeypatch.setenv("XDG_DATA_HOME", "/proc/nowhere")
-    assert main(["completion", "bash", "--install"]) == 2
-    assert "/proc/nowhere/bash-completion/completions/mastctl" in capsys.readouterr().err

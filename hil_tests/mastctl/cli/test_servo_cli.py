@@ -1,4 +1,4 @@
-"""`mastctl servo`: finding, reading and numbering simulated servos on a turned clock."""
+"""`mastctl rig servo`: finding, reading and numbering simulated servos on a turned clock."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Bench]:
 
 def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, Any, str]:
     """The exit code, what was printed (JSON where asked for), and what was told."""
-    code = main(["servo", *words])
+    code = main(["rig", "servo", *words])
     out, err = capsys.readouterr()
     return code, json.loads(out) if "--json" in words else out, err
 
@@ -135,7 +135,7 @@ def test_set_id_drops_torque_only_when_told_to(bench: Bench, capsys: pytest.Capt
     ("words", "error"),
     [
         (("info", "foo://x", "1"), "protocol 'foo' not known"),
-        (("info", "PORT", "1", "--family", "flir_ptu"), "no servos: 'mastctl ptu info PORT' queries it"),
+        (("info", "PORT", "1", "--family", "flir_ptu"), "no servos: 'mastctl rig ptu info PORT' queries it"),
     ],
 )
 def test_wrong_use_is_one_line_and_exit_2(

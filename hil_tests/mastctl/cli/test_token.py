@@ -36,11 +36,11 @@ def kept(tmp_path: Path) -> Path:
 def test_a_token_is_made_where_the_running_daemon_reads_it(
     net: Network, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["token", "new", "--name", "wall", "--role", "view"]) == 0
+    assert main(["rig", "token", "new", "--name", "wall", "--role", "view"]) == 0
     token = capsys.readouterr().out.strip()
     assert "wall" in [one.name for one in net.tokens.read() or ()]
     assert not (tmp_path / "user").exists()
-    assert main(["token", "list", "--json"]) == 0
+    assert main(["rig", "token", "list", "--json"]) == 0
     assert "wall" in [one["name"] for one in json.loads(capsys.readouterr().out)["tokens"]]
     with Client(net.url, token=token) as client:
         until(lambda: admitted(client), "the daemon to know the token")
@@ -62,7 +62,7 @@ def test_a_configuration_of_no_running_daemon_makes_no_token(
     (tmp_path / "little.yaml").write_bytes(little_mast_file())
     config.write_text(CONFIG.format(listen="{port: 1, hosts: [rover.test]}"))
     for words in (["new", "--name", "wall", "--role", "view"], ["list"], ["revoke", "wall"]):
-        assert main(["token", *words, "--config", str(config)]) != 0
+        assert main(["rig", "token", *words, "--config", str(config)]) != 0
         said = capsys.readouterr().err
         assert "no daemon answers at http://127.0.0.1:1" in said and "--state FOLDER" in said
     assert not (tmp_path / "user").exists()
@@ -72,22 +72,22 @@ def test_a_token_is_made_listed_and_revoked_in_a_folder_that_a_daemon_kept(
     kept: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     there = ["--state", str(kept)]
-    assert main(["token", "new", "--name", "wall", "--role", "view", *there]) == 0
+    assert main(["rig", "token", "new", "--name", "wall", "--role", "view", *there]) == 0
     text = capsys.readouterr().out.strip()
     assert len(text) == 43
-    assert main(["token", "list", "--json", *there]) == 0
+    assert main(["rig", "token", "list", "--json", *there]) == 0
     shown = capsys.readouterr().out
     assert "wall" in [one["name"] for one in json.loads(shown)["tokens"]]
     listed = TokenList(kept).read()
     assert listed is not None and text not in shown and listed[-1].sha256 not in shown
-    assert main(["token", "revoke", "wall", *there]) == 0
+    assert main(["rig", "token", "revoke", "wall", *there]) == 0
     assert [one.name for one in TokenList(kept).read() or ()] == ["view", "operate", "admin"]
 
 
 def test_a_folder_that_no_daemon_kept_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for words in (["new", "--name", "wall", "--role", "view"], ["list"], ["revoke", "wall"]):
         for folder in (tmp_path, tmp_path / "nowhere"):
-            assert main(["token", *words, "--state", str(folder)]) == 2
+            assert main(["rig", "token", *words, "--state", str(folder)]) == 2
             assert f"{folder}: no daemon has kept its state here" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 

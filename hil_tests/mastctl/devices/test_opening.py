@@ -121,15 +121,15 @@ def watched(
 
 STILL_RAD = 1e-3
 OPENING = {
-    "servo set-id": ["PORT", "1", "7", "--torque-off"],
-    "ptu home": ["PORT", "--sweep-full-range"],
+    "rig servo set-id": ["PORT", "1", "7", "--torque-off"],
+    "rig ptu home": ["PORT", "--sweep-full-range"],
     "camera check": [CAMERA, "--with-head", "--seconds", "0.3", "--config", "CONFIG"],
     "camera sync": ["--seconds", "3", "--config", "CONFIG"],
-    "sentinel reference": ["--folder", "sentinel", "--config", "CONFIG"],
+    "rig sentinel reference": ["--folder", "sentinel", "--config", "CONFIG"],
 }
 """Commands that open a head beside a daemon; import-linter keeps them few. Those that only read have tests
 of their own that nothing moves."""
-MOVING = {"camera sync", "servo set-id", "ptu home"}
+MOVING = {"camera sync", "rig servo set-id", "rig ptu home"}
 
 
 @BOTH
@@ -138,7 +138,7 @@ def test_no_command_moves_a_latched_head(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     watched.latch()
-    others = "ptu" if watched.bench.driver == "dynamixel" else "servo"
+    others = "rig ptu" if watched.bench.driver == "dynamixel" else "rig servo"
     places = {"PORT": watched.port, "CONFIG": watched.config}
     for name, options in OPENING.items():
         if name.startswith(others):
@@ -203,10 +203,10 @@ def test_what_may_move_a_head_is_refused_beside_its_daemon(
     watched: Watched, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with daemon_process(watched.bench.folder, watched.bench.config) as daemon, Client(line(daemon)):
-        home = ["ptu", "home", watched.port, "--sweep-full-range"]
+        home = ["rig", "ptu", "home", watched.port, "--sweep-full-range"]
         for words in (
             ["camera", "sync", "--config", watched.config],
-            home if watched.bench.driver == "flir_ptu" else ["servo", "info", watched.port, "1"],
+            home if watched.bench.driver == "flir_ptu" else ["rig", "servo", "info", watched.port, "1"],
         ):
             assert main(words) == 1
             assert "by another program" in capsys.readouterr().err

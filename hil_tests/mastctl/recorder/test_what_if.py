@@ -125,7 +125,15 @@ def test_with_its_own_mast_file_the_recorded_residuals_come_out(files: dict[str,
 def test_the_command_tells_a_table_and_draws_a_page(
     files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["replay", str(files["wrong run"]), "--mast", str(files["right"]), "--report", str(tmp_path)]
+    words = [
+        "record",
+        "replay",
+        str(files["wrong run"]),
+        "--mast",
+        str(files["right"]),
+        "--report",
+        str(tmp_path),
+    ]
     assert main([*words, "--json"]) == 0
     told: dict[str, Any] = json.loads(capsys.readouterr().out)
     row = told["rms_px"]["first pointing"]

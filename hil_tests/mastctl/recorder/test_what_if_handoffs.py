@@ -55,7 +55,7 @@ def files(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[st
 
 
 def handed(files: dict[str, Path], mast: str, capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
-    assert main(["replay", str(files["run"]), "--mast", str(files[mast]), "--json"]) == 0
+    assert main(["record", "replay", str(files["run"]), "--mast", str(files[mast]), "--json"]) == 0
     rows: list[dict[str, Any]] = json.loads(capsys.readouterr().out)["handoffs"]
     assert {one["camera"] for one in rows} == {"hazcam_left", "hazcam_right"}
     return rows

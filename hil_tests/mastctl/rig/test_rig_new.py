@@ -122,7 +122,7 @@ def test_two_servos_become_a_rig_and_the_scan_changes_nothing(
         told = written(capsys, str(folder), "--port", port)
     assert [dict(servo.table.values) for servo in servos] == before
     assert told["heads"] == [f"{port}: XL330-M288-T (id 3, 1000000 baud), XL330-M288-T (id 4, 1000000 baud)"]
-    assert told["next"][0] == f"mastctl doctor --config {folder / CONFIG}"
+    assert told["next"][0] == f"mastctl rig doctor --config {folder / CONFIG}"
     good_by_schema(folder)
     settings = dynamixel_settings(load_config(folder / CONFIG).hardware.pan_tilt.options)
     assert (settings.pan.servo_id, settings.tilt.servo_id) == (3, 4)

@@ -68,7 +68,7 @@ class Bench:
         until(moves, "the move")
 
     def halt(self) -> subprocess.CompletedProcess[str]:
-        command = [*forks.MASTCTL, "halt", "--config", str(self.config), "--json"]
+        command = [*forks.MASTCTL, "stop", "--without-daemon", "--config", str(self.config), "--json"]
         return forks.run(command, timeout=NET_S)
 
 

@@ -1,4 +1,4 @@
-"""`mastctl sim new`: a rig of one's own that runs at once, drawn as its mast file says it was calibrated."""
+"""`mastctl rig sim new`: a rig that runs at once, drawn as its mast file says it was calibrated."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FILES = ("config.yaml", "mast.yaml", "true_rig.yaml")
 
 
 def made(folder: Path, *words: str) -> dict[str, bytes]:
-    assert main(["sim", "new", str(folder), *words]) == 0
+    assert main(["rig", "sim", "new", str(folder), *words]) == 0
     return {name: (folder / name).read_bytes() for name in FILES}
 
 
@@ -71,7 +71,7 @@ def test_a_rig_is_never_overwritten_unless_that_is_asked_for(
 ) -> None:
     before = made(tmp_path, "--seed", "1")
     (tmp_path / "config.yaml").unlink()
-    assert main(["sim", "new", str(tmp_path), "--seed", "2"]) == 2
+    assert main(["rig", "sim", "new", str(tmp_path), "--seed", "2"]) == 2
     told = capsys.readouterr().err
     assert "mast.yaml exists" in told and "--force" in told
     assert (tmp_path / "mast.yaml").read_bytes() == before["mast.yaml"]

@@ -28,7 +28,7 @@ def daemon(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterat
     with small_rover(repository, tmp_path_factory.mktemp("sentinel")) as made:
         folder = made.service.folder.path / "sentinel"
         rests = [word for rest in RESTS for word in (f"--pose={rest}",)]
-        assert main(["sentinel", "reference", "--folder", str(folder), "--url", made.url, *rests]) == 0
+        assert main(["rig", "sentinel", "reference", "--folder", str(folder), "--url", made.url, *rests]) == 0
         yield made
 
 
@@ -45,7 +45,7 @@ def run(daemon: RunningDaemon, folder: Path, capsys: pytest.CaptureFixture[str])
     def call(*words: str, where: Path = folder) -> tuple[int, str, str]:
         capsys.readouterr()
         asks = () if words[0] == "status" else ("--url", daemon.url)
-        code = main(["sentinel", *words, "--folder", str(where), *asks])
+        code = main(["rig", "sentinel", *words, "--folder", str(where), *asks])
         out, log = capsys.readouterr()
         return code, out.strip(), log.strip()
 

@@ -175,7 +175,7 @@ def test_a_damaged_reference_is_refused_in_a_sentence(change: Any, phrase: str, 
 
 
 def test_no_reference_says_how_to_take_one(tmp_path: Path) -> None:
-    with pytest.raises(BadFile, match="holds no reference; take one: mastctl sentinel reference"):
+    with pytest.raises(BadFile, match="holds no reference; take one: mastctl rig sentinel reference"):
         read_reference(tmp_path)
     save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
     for file in tmp_path.glob("pictures-*/*.png"):

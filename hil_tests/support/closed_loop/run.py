@@ -13,7 +13,7 @@ from drivers.sim.kept import kept_home
 from hil_tests.support.closed_loop import files
 from hil_tests.support.living_daemon import started
 from hil_tests.support.virtual_machine import boot
-from mastctl.cli.output import at_least, positive_number
+from mastctl.cli.options import at_least, positive_number
 from mastctl.client import Client
 from mastctl.experiment.pointing import PointingExperiment, TargetRecord, run_pointing_experiment
 from tools.command import end

@@ -1,0 +1,237 @@
+"""Commands and their options as a table over argparse: each is declared once, beside its function.
+
+An option is written as its usage shows it: ``--target X Y Z``, ``--role view|operate|admin``, ``-q,--quiet``,
+and a positional argument as ``FILE``, ``[FILE]``, ``FILE...`` or ``[FILE...]``. The name of a value says how
+it is read: `READERS`. A command returns an `mastctl.cli.output.Answer`, or an exit code where it has written
+everything itself.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+from mastctl.cli.output import Answer, WrongUse
+
+Run = Callable[[argparse.Namespace], "Answer | int"]
+
+
+def finite_number(text: str) -> float:
+    """Read a value as a finite number (argparse ``type``)."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value) or "_" in text:
+        raise argparse.ArgumentTypeError(f"'{text}' where a finite number is expected")
+    return value
+
+
+def angle_rad(text: str) -> float:
+    """Read a value as an angle of at most a full turn, radians (argparse ``type``)."""
+    value = finite_number(text)
+    if abs(value) > math.tau:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' where radians are expected, at most {math.tau:.2f} (a full turn); "
+            f"{value:g} degrees are {math.radians(value):.6g}"
+        )
+    return value
+
+
+def positive_number(text: str) -> float:
+    """Read a value as a finite number above zero (argparse ``type``)."""
+    value = finite_number(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"'{text}' where a number above zero is expected")
+    return value
+
+
+def not_negative(text: str) -> float:
+    """Read a value as a finite number of zero or more (argparse ``type``)."""
+    value = finite_number(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"'{text}' where zero or more is expected")
+    return value
+
+
+def at_least(least: int) -> Callable[[str], int]:
+    """Return what reads a value as a whole number of at least ``least`` (argparse ``type``)."""
+
+    def read(text: str) -> int:
+        if not (text.isascii() and text.isdigit() and len(text) < 19) or int(text) < least:
+            raise argparse.ArgumentTypeError(f"'{text}' where a whole number of at least {least} is expected")
+        return int(text)
+
+    return read
+
+
+def path(text: str) -> Path:
+    """Read a value as a path; an empty one (a variable that is not set) would be the current folder."""
+    if not text.strip():
+        raise argparse.ArgumentTypeError("the name is empty, a path is expected ('.' is the current folder)")
+    return Path(text)
+
+
+READERS: Mapping[str, Callable[[str], Any]] = {
+    **dict.fromkeys(("S", "M", "PX", "DEG", "HZ"), positive_number),
+    **dict.fromkeys(("RAD", "X", "Y", "Z", "U", "V", "LOW", "HIGH", "MM"), finite_number),
+    **dict.fromkeys(("FILE", "DIR", "FOLDER", "IN", "OUT", "SURVEY"), path),
+    "SEED": at_least(0),
+    "N": at_least(1),
+}
+"""How a value is read by its name; one that ends with a suffix of files is a path, any other is a text."""
+
+
+class Option(NamedTuple):
+    """An option or argument as argparse takes it."""
+
+    names: list[str]
+    settings: dict[str, Any]
+
+    def add_to(self, parser: Any) -> None:
+        """Declare it to a parser or a group of one."""
+        parser.add_argument(*self.names, **self.settings)
+
+
+class Group(NamedTuple):
+    """Options that exclude each other, or that stand together under a title."""
+
+    options: tuple[Option | Group, ...]
+    exclusive: bool = False
+    required: bool = False
+    title: str = ""
+    about: str = ""
+
+    def add_to(self, parser: Any) -> None:
+        """Declare them to a parser or a group of one."""
+        if self.title:
+            parser = parser.add_argument_group(self.title, self.about)
+        if self.exclusive:
+            parser = parser.add_mutually_exclusive_group(required=self.required)
+        for one in self.options:
+            one.add_to(parser)
+
+
+def one_of(*options: Option, required: bool = False) -> Group:
+    """Return options of which one at most may be given, or exactly one."""
+    return Group(options, exclusive=True, required=required)
+
+
+def option(usage: str, help: str, *, repeat: bool = False, **settings: Any) -> Option:
+    """Return an option or a positional argument.
+
+    Parameters
+    ----------
+    usage
+        As in the module's description.
+    repeat
+        Whether it may be given several times; its value is then a list.
+    settings
+        argparse's own, over those that follow from ``usage``. A default stands in the help too.
+    """
+    name, *values = usage.split()
+    default = settings.get("default")
+    if default not in (None, "", False, []) and "(default" not in help:
+        shown = " ".join(map(str, default)) if isinstance(default, (list, tuple)) else f"{default}"
+        help = f"{help} (default {shown.removesuffix('.0')})"
+    found: dict[str, Any] = {"help": help.replace("%", "%%")}
+    if not name.startswith("-"):
+        inner = name.strip("[]")
+        found["nargs"] = {"[...": "*", "...": "+", "[": "?"}.get(
+            ("[" if name != inner else "") + ("..." if inner.endswith("...") else "")
+        )
+        values = [inner.removesuffix("...")]
+        name = settings.pop("dest", re.split(r"[^A-Za-z_]", values[0])[0].lower())
+    elif not values:
+        return Option(name.split(","), {**found, "action": "store_true", **settings})
+    elif len(values) > 1:
+        found["nargs"] = len(values)
+    elif values[0].endswith("..."):
+        found["nargs"], values = "+", [values[0].removesuffix("...")]
+    if "|" in values[0]:
+        found["choices"] = values[0].split("|")
+    else:
+        found["metavar"] = tuple(values) if len(values) > 1 else values[0]
+        found["type"] = _reader(values)
+    if repeat:
+        found |= {"action": "append", "default": []}
+    found |= settings
+    return Option(name.split(","), {key: value for key, value in found.items() if key != "nargs" or value})
+
+
+def _reader(values: list[str]) -> Callable[[str], Any]:
+    readers = {path if re.search(r"\.[a-z]+$", value) else READERS.get(value, str) for value in values}
+    return readers.pop() if len(readers) == 1 else str
+
+
+class Command(NamedTuple):
+    """A command: its words after ``mastctl``, what it does, its options and an example of them."""
+
+    words: str
+    help: str
+    options: tuple[Option | Group, ...]
+    example: str
+    about: str
+    run: Run
+
+
+DECLARED: dict[str, Command] = {}
+"""Every command of the modules that are imported, by its words."""
+
+GROUPS: dict[str, str] = {}
+"""What the groups of their commands are for, by their words."""
+
+
+def command(
+    words: str, *options: Option | Group, help: str = "", example: str = "", about: str = ""
+) -> Callable[[Run], Run]:
+    """Return a decorator that makes a function a command.
+
+    Parameters
+    ----------
+    help
+        What it does; of a command of one word, `mastctl.cli.main.OVERVIEW` says it.
+    example
+        Options and arguments that a shell would take, which ``--help`` shows.
+    about
+        The description of its own ``--help``, where ``help`` is too short.
+    """
+
+    def declare(run: Run) -> Run:
+        DECLARED[words] = Command(words, help, options, example, about, run)
+        return run
+
+    return declare
+
+
+def add_options(parser: Any, *options: Option | Group) -> None:
+    """Add declared options to a parser of argparse."""
+    for one in options:
+        one.add_to(parser)
+
+
+# argparse's own pattern knows -1 and -1.5 but takes -1e-3 for an option; "not finite" texts get our message.
+_NEGATIVE_NUMBER = re.compile(r"^-(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?$|^-(?:inf|infinity|nan)$", re.IGNORECASE)
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that refuses in one line, reads any negative number, and gives each command --json."""
+
+    def __init__(self, *args: Any, **settings: Any) -> None:
+        settings.setdefault("allow_abbrev", False)
+        super().__init__(*args, **settings)
+        self._negative_number_matcher = _NEGATIVE_NUMBER
+        self.add_argument(
+            "--json",
+            action="store_true",
+            default=argparse.SUPPRESS,
+            help="print one JSON document on stdout and nothing else",
+        )
+
+    def error(self, message: str) -> NoReturn:
+        """Refuse wrong use; the caller prints the one line."""
+        raise WrongUse(f"{message} (see '{self.prog} --help')")
