@@ -24,7 +24,7 @@ from typing import Any, NoReturn
 
 from mastctl import signals
 from mastctl.cli import output
-from mastctl.cli.options import DECLARED, GROUPS, Command, Parser, add_options
+from mastctl.cli.options import DECLARED, GROUPS, CommandLine, Parser, add_options
 from mastctl.logs import TEXT, QueuedHandler, writer_to
 
 log = logging.getLogger(__name__)
@@ -131,7 +131,7 @@ def _group(inner: dict[str, Any], words: str, help: str) -> None:
     )
 
 
-def _add(inner: dict[str, Any], one: Command) -> None:
+def _add(inner: dict[str, Any], one: CommandLine) -> None:
     """Add a command that does something; one below another such is joined with it, as ``calibrate bench``."""
     above, _, name = one.words.rpartition(" ")
     if one.words in COMMANDS:

@@ -168,7 +168,7 @@ def _reader(values: list[str]) -> Callable[[str], Any]:
     return readers.pop() if len(readers) == 1 else str
 
 
-class Command(NamedTuple):
+class CommandLine(NamedTuple):
     """A command: its words after ``mastctl``, what it does, its options and an example of them."""
 
     words: str
@@ -179,7 +179,7 @@ class Command(NamedTuple):
     run: Run
 
 
-DECLARED: dict[str, Command] = {}
+DECLARED: dict[str, CommandLine] = {}
 """Every command of the modules that are imported, by its words."""
 
 GROUPS: dict[str, str] = {}
@@ -202,7 +202,7 @@ def command(
     """
 
     def declare(run: Run) -> Run:
-        DECLARED[words] = Command(words, help, options, example, about, run)
+        DECLARED[words] = CommandLine(words, help, options, example, about, run)
         return run
 
     return declare
