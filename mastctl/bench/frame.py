@@ -17,7 +17,7 @@ from calib.geometry.rig import Mast, Rig
 from calib.geometry.rigid import Rigid
 from calib.plan.placements import FEWEST
 from calib.survey.records import Survey
-from mastctl.bench.differences import implied_motion
+from mastctl.calibration.differences import implied_motion
 from mastctl.errors import MastctlError
 
 UPRIGHT = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from calib.adjust.solver import covariance_of
 from calib.errors import CalibError, Unreachable
-from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid, rigid_rates
 from calib.plan.knowledge import BenchShot, BoardView, ExpectedPointing, Knowledge, Workspace, pointing
 from calib.plan.placements import FEWEST, body_cameras
@@ -25,7 +24,7 @@ from mastctl.bench.eyes import BenchHead, BenchLook
 from mastctl.bench.folder import RunFolder, looks_of
 from mastctl.bench.frame import FitSurvey, FittedBench
 from mastctl.bench.reporter import CELLS
-from mastctl.errors import MastctlError
+from mastctl.calibration.landing import first_cameras
 
 USUAL_PAN_RAD, USUAL_TILT_RAD = (-1.2, 1.2), (-0.9, 0.3)
 """Where a rig points, as far as the limits let it."""
@@ -299,23 +298,6 @@ class BenchKnowledge:
         )
         in_board_m = self.board.in_board_m(one.corners.ids)
         return rover_from_board(self.now.rig, one.camera, *true_rad, in_board_m, one.corners.pixels_px)
-
-
-def first_cameras(rig: Rig) -> tuple[str, ...]:
-    """Return the cameras that point: the Navcam pair, else a pair on the head, else one camera.
-
-    Raises
-    ------
-    MastctlError
-        If no camera is on the head.
-    """
-    pairs = {n: p for n, p in rig.stereo.items() if all(rig.cameras[c].on == "head" for c in p)}
-    if pairs:
-        return pairs.get("navcam") or next(iter(pairs.values()))
-    single = [name for name, camera in rig.cameras.items() if camera.on == "head"]
-    if not single:
-        raise MastctlError("the mast file has no camera on the head, and so no head to calibrate")
-    return (single[0],)
 
 
 def _worth_a_fit(looks: int, fitted: int) -> bool:

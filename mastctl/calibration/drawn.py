@@ -1,84 +1,208 @@
-"""What is drawn of a calibration: each function returns a matplotlib figure."""
+"""What is drawn of a survey's or a bench's calibration: each function returns a matplotlib figure."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from calib.adjust.result import Calibration, ImageResiduals
-from calib.geometry.rig import Rig
-from calib.geometry.rigid import Rigid
+from calib.adjust.result import BenchCalibration, Calibration, FittedRig, ImageResiduals
+from calib.geometry.covariance import RigCovariance
+from calib.geometry.parameters import predict
+from calib.geometry.rig import JOINTS_NAMES, AxisJoint, Rig
+from calib.geometry.rigid import FloatArray, Rigid
+from calib.plan.knowledge import ExpectedPointing
+from calib.survey.records import Survey
 from calib.targets.boards import Board
-from mastctl.calibration.landing import PointingMap
+from mastctl.calibration.differences import Difference
 from mastctl.report import plots
 
-FITTED, CHECK, LEFT_OUT = plots.BLUE, plots.RUST, "#999999"
+CELLS = (16, 12)
+"""Of an image in which corners are counted."""
+
 ARROW_PART = 0.025
-"""The typical residual is drawn this part of the image's width long; check images have their own scale."""
+"""The typical residual is drawn this part of the image's width long."""
 
 MANY_DOTS = 2500
-NAME_ROOM_M = 0.5
+NAME_SPACE_M = 0.5
 """A board's name is left out where another name is nearer than this."""
 
+SIDES = ((1, plots.BLUE, "came from smaller angles"), (-1, plots.RUST, "came from larger angles"),
+         (0, plots.GREY, "came from either side"))  # fmt: skip
 
-def residuals(calibration: Calibration, camera: str) -> Any:
-    """Draw the residuals of a camera's dots as arrows over its image: fitted images, and check images."""
-    mine = [image for image in calibration.images if image.camera == camera]
-    fitted = dots_of(mine, lambda image: image.used)
-    check = dots_of(mine, lambda image: np.full(len(image.used), image.purpose == "check"))
-    out = dots_of(mine, lambda image: ~image.used & (image.purpose != "check"))
-    shown = [("fitted images", fitted, FITTED)] + ([("check images", check, CHECK)] if len(check[0]) else [])
-    figure = plots.new(11.5, 4.3)
-    axes = figure.subplots(1, 2, sharey=True)
-    for axis, (title, (places, arrows), colour) in zip(axes, shown, strict=False):
-        _arrows(axis, places, arrows, colour, calibration.rig.cameras[camera].model.size_px)
-        axis.set_title(f"{camera}, {title}", fontsize=10)
-    if len(out[0]):
-        axes[0].scatter(*out[0].T, marker="x", s=16, color=LEFT_OUT, label="left out", zorder=3)
-        axes[0].legend(loc="upper right", fontsize=7, framealpha=0.8)
-    for axis in axes[len(shown) :]:
-        axis.set_axis_off()
-    axes[0].set_ylabel("y, px")
+
+def cells_seen(fit: FittedRig, camera: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return how many fitted corners each of an image's `CELLS` has, (columns, rows), and the edges, px."""
+    width, height = fit.rig.cameras[camera].model.size_px
+    places, _ = _dots(_of_camera(fit, camera))
+    return np.histogram2d(
+        places[:, 0], places[:, 1], bins=CELLS, range=((-0.5, width - 0.5), (-0.5, height - 0.5))
+    )
+
+
+def coverage(fit: FittedRig, cameras: Sequence[str]) -> Any:
+    """Draw where in each camera's image corners were seen, and how many."""
+    figure, axes = _image_of_each(fit.rig, cameras)
+    for axis, name in zip(axes, cameras, strict=True):
+        counts, xs, ys = cells_seen(fit, name)
+        shown = axis.pcolormesh(xs, ys, np.ma.masked_equal(counts.T, 0), cmap="viridis", vmin=0)
+        seen = float((counts > 0).mean())
+        title = f"{name}: {counts.sum():.0f} corners over {100 * seen:.0f} % of the image"
+        axis.set_title(title, fontsize=10)
+        axis.set_facecolor("#dddddd")
+        figure.colorbar(shown, ax=axis, label="corners a cell", shrink=0.8)
     return figure
 
 
-def _arrows(axis: Any, places: np.ndarray, arrows: np.ndarray, colour: str, size_px: tuple[int, int]) -> None:
-    """Residuals at their dots, the typical one a fixed part of the image long, and how long that is."""
-    over_picture(axis, size_px)
-    if not len(places):
-        axis.set_xlabel("x, px")
-        return
-    scale = arrow_scale(arrows, size_px[0])
-    draw_arrows(axis, places, arrows, colour, scale)
-    axis.set_xlabel(f"x, px; arrows drawn {1 / scale:.0f} times as long")
+def residuals(fit: FittedRig, cameras: Sequence[str]) -> Any:
+    """Draw each camera's residuals as arrows over its image, fitted ones and those that were not."""
+    figure, axes = _image_of_each(fit.rig, cameras)
+    for axis, name in zip(axes, cameras, strict=True):
+        width = fit.rig.cameras[name].model.size_px[0]
+        for check, colour, label in ((False, plots.BLUE, "fitted"), (True, plots.RUST, "not fitted")):
+            places, arrows = _dots(_of_camera(fit, name, check))
+            if not check:
+                scale = _arrow_scale(arrows, width)
+            if len(places):
+                step = -(-len(places) // MANY_DOTS)
+                axis.quiver(
+                    *places[::step].T, *arrows[::step].T, color=colour, angles="xy", scale_units="xy",
+                    scale=scale, width=0.0018, headwidth=4, headlength=5, alpha=0.8, label=label,
+                )  # fmt: skip
+        out = [image.pixels_px[~image.used] for image in _of_camera(fit, name)]
+        if out and len(left_out := np.concatenate(out)):
+            axis.scatter(*left_out.T, marker="x", s=14, color=plots.GREY, label="left out")
+        rms = fit.rms_px.get(name, (float("nan"),) * 2)
+        axis.set_title(f"{name}: rms {rms[0]:.3f}, {rms[1]:.3f} px", fontsize=10)
+        axis.set_xlabel(f"x, px; arrows drawn {1 / scale:.0f} times as long")
+        axis.legend(loc="lower right", fontsize=7, framealpha=0.8)
+    return figure
 
 
-def over_picture(axis: Any, size_px: tuple[int, int]) -> None:
-    """Give an axes the extent of a picture, y downwards."""
-    width, height = size_px
-    axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal")
+def over_images(fit: FittedRig, cameras: Sequence[str]) -> Any:
+    """Draw each image's mean residual over the joint that moves it (pan in x, tilt in y), and its rms over
+    the board's range and its angle to the line of sight."""
+    figure = plots.new(11.5, 5.8)
+    panels: Sequence[tuple[str, str, Callable[[ImageResiduals], tuple[float | None, float, float]]]] = (
+        ("pan read, deg", "mean residual in x, px", lambda i: (_degrees(i.pan_rad), *_mean(i, 0))),
+        ("tilt read, deg", "mean residual in y, px", lambda i: (_degrees(i.tilt_rad), *_mean(i, 1))),
+        ("range, m", "rms, px an axis", lambda i: (i.range_m, _rms(i), 0.0)),
+        ("board turned away, deg", "rms, px an axis", lambda i: (_degrees(i.incidence_rad), _rms(i), 0.0)),
+    )
+    axes = figure.subplots(2, 2).ravel()
+    for axis, (across, up, value) in zip(axes, panels, strict=True):
+        for index, name in enumerate(cameras):
+            for check in (False, True):
+                points = [value(image) for image in _of_camera(fit, name, check) if _counted(image).any()]
+                known = np.array([one for one in points if one[0] is not None], dtype=float)
+                if len(known):
+                    axis.errorbar(
+                        *known.T, fmt="^" if check else "o", ms=4, lw=0.8, alpha=0.75,
+                        color=plots.COLOURS[index % len(plots.COLOURS)],
+                        label=f"{name}{', not fitted' if check else ''}",
+                    )  # fmt: skip
+        axis.set(xlabel=across, ylabel=up)
+        axis.grid(alpha=0.25)
+    figure.legend(*axes[2].get_legend_handles_labels(), loc="outside upper center", ncols=4, fontsize=8)
+    return figure
 
 
-def arrow_scale(arrows: np.ndarray, width_px: int) -> float:
-    """Return what a pixel of the drawing is of a residual (n, 2), the typical one `ARROW_PART` long."""
-    typical = float(np.sqrt(np.mean(np.sum(arrows**2, axis=1)))) if len(arrows) else 0.0
-    return max(typical, 1e-9) / (ARROW_PART * width_px)
+def joint_curves(fit: BenchCalibration, survey: Survey) -> Any:
+    """Draw what each joint's reading is wrong by: the fitted curve, its 95 % band, what each image says."""
+    figure = plots.new(11.5, 4.2)
+    known = RigCovariance(fit.parameter_names, fit.covariance)
+    for axis, joint in zip(figure.subplots(1, 2), ("pan", "tilt"), strict=True):
+        model: AxisJoint = getattr(fit.rig.joints, joint)
+        seen = _by_joint(fit, survey, joint)
+        low, high = (min(s[0] for s in seen), max(s[0] for s in seen)) if seen else (-1.0, 1.0)
+        read = np.linspace(low - 0.15, high + 0.15, 200)
+        for side, colour, label in SIDES:
+            mine = np.array([(one[0], one[1]) for one in seen if one[2] == side])
+            if not len(mine):
+                continue
+            approach = np.full(len(read), float(side))
+            curve = np.asarray(model.true_rad(read, approach)) - read
+            spread = 1.96 * _curve_sigma(known, joint, model, read, approach)
+            degrees, band = np.degrees(read), (1e3 * (curve - spread), 1e3 * (curve + spread))
+            axis.plot(degrees, 1e3 * curve, color=colour, lw=1.4, label=label)
+            axis.fill_between(degrees, *band, color=colour, alpha=0.18, lw=0)
+            axis.scatter(np.degrees(mine[:, 0]), 1e3 * mine[:, 1], s=12, color=colour, alpha=0.75)
+        axis.axhline(0.0, color="0.6", lw=0.8)
+        axis.grid(alpha=0.25)
+        axis.set(xlabel=f"{joint} read, deg", ylabel="true less read, mrad", title=f"{joint}")
+        axis.legend(fontsize=7)
+    return figure
 
 
-def draw_arrows(
-    axis: Any, places: np.ndarray, arrows: np.ndarray, colour: str, scale: float, label: str | None = None
-) -> None:
-    """Draw residuals (n, 2) at their places (n, 2), at most some `MANY_DOTS` of them."""
-    step = -(-len(places) // MANY_DOTS) or 1
-    axis.quiver(
-        *places[::step].T, *arrows[::step].T, color=colour, angles="xy", scale_units="xy",
-        scale=scale, width=0.0018, headwidth=4, headlength=5, alpha=0.8, label=label,
-    )  # fmt: skip
+def lens_uncertainty(fit: FittedRig, cameras: Sequence[str], range_m: float = 5.0) -> Any:
+    """Draw how sure projection is over each image, 95 %, of a point of the head ``range_m`` away."""
+    figure, axes = _image_of_each(fit.rig, cameras)
+    covariance = np.asarray(fit.covariance)
+    for axis, name in zip(axes, cameras, strict=True):
+        model = fit.rig.cameras[name].model
+        width, height = model.size_px
+        columns, rows = 24, max(2, round(24 * height / width))
+        x, y = np.meshgrid(
+            (np.arange(columns) + 0.5) * width / columns, (np.arange(rows) + 0.5) * height / rows
+        )
+        rays = model.ray(np.stack([x.ravel(), y.ravel()], axis=-1))
+        rates = predict(model, rays.origins_m + range_m * rays.directions).d_step
+        mine = fit.part(f"cameras.{name}.")
+        variance = np.einsum("nip,pq,niq->n", rates, covariance[np.ix_(mine, mine)], rates) / 2.0
+        sigma = np.sqrt(np.maximum(variance, 0.0)).reshape(rows, columns)
+        shown = axis.imshow(
+            1.96 * sigma, extent=(-0.5, width - 0.5, height - 0.5, -0.5), cmap="viridis", vmin=0
+        )
+        figure.colorbar(shown, ax=axis, label="95 %, px", shrink=0.85)
+        axis.set_title(name, fontsize=10)
+    return figure
 
 
-def boards(calibration: Calibration, board: Board) -> Any:
+def workspace(aim: ExpectedPointing, covariance: FloatArray, fit: FittedRig) -> Any:
+    """Draw the predicted pointing error over pan and tilt, by range, with the attitudes of the images."""
+    squares = np.einsum("ip,pq,iq->i", aim.to_rig, covariance, aim.to_rig).reshape(-1, 2).mean(axis=1)
+    places = np.array(aim.places)
+    taken = sorted({(i.pan_rad, i.tilt_rad) for i in fit.images if i.pan_rad is not None})
+    ranges = np.unique(places[:, 2]).tolist()
+    figure = plots.new(3.9 * len(ranges), 3.6)
+    axes = np.atleast_1d(figure.subplots(1, len(ranges), sharey=True))
+    pans, tilts = np.unique(places[:, 0]), np.unique(places[:, 1])
+    maps = np.full((len(ranges), len(tilts), len(pans)), np.nan)
+    for index in np.ndindex(*maps.shape):
+        here = (places == (pans[index[2]], tilts[index[1]], ranges[index[0]])).all(axis=1)
+        if here.any():
+            maps[index] = np.sqrt(max(float(squares[here].mean()), 0.0))
+    for axis, range_m, values in zip(axes, ranges, maps, strict=True):
+        shown = axis.pcolormesh(
+            np.degrees(pans), np.degrees(tilts), values, shading="gouraud", cmap="viridis", vmin=0,
+            vmax=np.nanmax(maps),
+        )  # fmt: skip
+        axis.scatter(*np.degrees(np.array(taken)).T, s=10, c="white", edgecolors="black", lw=0.4)
+        axis.set(xlabel="pan, deg", title=f"target at {range_m:g} m")
+        axis.set_xlim(np.degrees(pans[0]), np.degrees(pans[-1]))
+        axis.set_ylim(np.degrees(tilts[0]), np.degrees(tilts[-1]))
+    axes[0].set_ylabel("tilt, deg")
+    figure.colorbar(shown, ax=axes, label="first pointing, rms an axis, px")
+    return figure
+
+
+def differences(found: Sequence[Difference], rig: Rig) -> Any:
+    """Draw how far each camera's lens is from the former mast file's, the implied motion taken out."""
+    figure, axes = _image_of_each(rig, [one.camera for one in found])
+    for axis, one in zip(axes, found, strict=True):
+        seen = ~np.isnan(one.lens_px).any(axis=1)
+        scale = _arrow_scale(one.lens_px[seen], one.size_px[0])
+        axis.quiver(
+            *one.pixels_px[seen].T, *one.lens_px[seen].T, color=plots.VIOLET, angles="xy", scale_units="xy",
+            scale=scale, width=0.003,
+        )  # fmt: skip
+        axis.set_title(f"{one.camera}: {one.rms_px:.2f} px rms", fontsize=10)
+        axis.set_xlabel(f"x, px; arrows drawn {1 / scale:.0f} times as long")
+    return figure
+
+
+def boards(fit: Calibration, board: Board) -> Any:
     """Draw every board and camera in the rover frame, from above and from the side."""
     figure = plots.new(10.5, 5.2)
     plan, side = figure.subplots(1, 2)
@@ -86,27 +210,34 @@ def boards(calibration: Calibration, board: Board) -> Any:
         [0, 0, board.rows - 1, board.rows - 1, 0], [0, board.columns - 1, board.columns - 1, 0, 0]
     )
     purposes: dict[tuple[str, str], str] = {}
-    for image in calibration.images:
+    for image in fit.images:
         purposes.setdefault((image.setup, image.placement), image.purpose)
-    colour_of = {"camera": FITTED, "mast": plots.GREEN, "check": CHECK}
+    colour_of = {"camera": plots.BLUE, "mast": plots.GREEN, "check": plots.RUST}
+    views = ((plan, (1, 0)), (side, (0, 2)))
     labelled: set[str] = set()
     names: list[np.ndarray] = []
-    for key, pose in calibration.rover_from_board.items():
+    for key, pose in fit.rover_from_board.items():
         purpose = purposes.get(key, "camera")
         outline = pose.points(corners)
         label = None if purpose in labelled else f"boards: {purpose}"
         labelled.add(purpose)
-        for axis, (across, up) in ((plan, (1, 0)), (side, (0, 2))):
+        for axis, (across, up) in views:
             axis.plot(outline[:, across], outline[:, up], color=colour_of[purpose], lw=1.5, label=label)
         place = outline[1, [1, 0]]
-        free = all(abs(place - other) @ (0.35, 1.0) > NAME_ROOM_M for other in names)
+        free = all(abs(place - other) @ (0.35, 1.0) > NAME_SPACE_M for other in names)
         if purpose != "camera" and free:  # those of a ring stand too close together for names
             names.append(place)
             name = plan.annotate(
                 key[1], place, fontsize=7, color="0.25", xytext=(2, 2), textcoords="offset points"
             )
             name.set_parse_math(False)  # a name with two dollars is no formula
-    _eyes(calibration.rig, plan, side)
+    for index, camera in enumerate(fit.rig.cameras):
+        model = fit.rig.camera_in_rover(camera, 0.0, 0.0)
+        ahead = Rigid(np.eye(3), model.C).points(0.8 * np.asarray(model.A))
+        label = "cameras at pan 0, tilt 0" if index == 0 else None
+        for axis, (across, up) in views:
+            axis.plot([model.C[across], ahead[across]], [model.C[up], ahead[up]], "k-", lw=1, label=label)
+            axis.plot(model.C[across], model.C[up], "k.", ms=4)
     plan.set(xlabel="y (right), m", ylabel="x (ahead), m", title="from above", aspect="equal")
     side.set(xlabel="x (ahead), m", ylabel="z (down), m", title="from the right side", aspect="equal")
     side.invert_yaxis()
@@ -116,136 +247,78 @@ def boards(calibration: Calibration, board: Board) -> Any:
     return figure
 
 
-def errors_by(calibration: Calibration) -> Any:
-    """Draw each image's rms over the board's range, its angle to the line of sight, pan and tilt."""
-    figure = plots.new(11.5, 3.6)
-    axes = figure.subplots(1, 4, sharey=True)
-    values: Sequence[tuple[str, Any]] = (
-        ("range, m", lambda image: image.range_m),
-        ("board turned away, deg", lambda image: np.degrees(image.incidence_rad)),
-        ("pan, deg", lambda image: None if image.pan_rad is None else np.degrees(image.pan_rad)),
-        ("tilt, deg", lambda image: None if image.tilt_rad is None else np.degrees(image.tilt_rad)),
-    )
-    cameras = list(calibration.rig.cameras)
-    for axis, (label, value) in zip(axes, values, strict=True):
-        for index, camera in enumerate(cameras):
-            for purpose, marker in (("fitted", "o"), ("check", "^")):
-                points = [
-                    (value(image), _image_rms(image))
-                    for image in calibration.images
-                    if image.camera == camera
-                    and (image.purpose == "check") == (purpose == "check")
-                    and value(image) is not None
-                    and (image.purpose == "check" or image.used.any())
-                ]
-                if points:
-                    colour = plots.COLOURS[index % len(plots.COLOURS)]
-                    name = camera if purpose == "fitted" else None
-                    axis.scatter(*np.array(points, dtype=float).T, s=18, marker=marker, color=colour,
-                                 alpha=0.75, label=name)  # fmt: skip
-        axis.set_xlabel(label)
-        plots.errors_upwards(axis)
-    axes[0].set_ylabel("rms of an image, px an axis")
-    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=6, fontsize=8)
-    return figure
+def _image_of_each(rig: Rig, cameras: Sequence[str]) -> tuple[Any, Any]:
+    """A figure with an axes of each camera's image, y downwards."""
+    figure = plots.new(5.6 * len(cameras), 4.4)
+    axes = np.atleast_1d(figure.subplots(1, len(cameras)))
+    for axis, name in zip(axes, cameras, strict=True):
+        width, height = rig.cameras[name].model.size_px
+        axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), aspect="equal", xlabel="x, px")
+    axes[0].set_ylabel("y, px")
+    return figure, axes
 
 
-def correlation(names: Sequence[str], covariance: np.ndarray, title: str) -> Any:
-    """Draw the correlation of parameters as a coloured square; numbers where they are few."""
-    spread = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    matrix = covariance / np.outer(spread, spread)
-    few = len(names) <= 10
-    figure = plots.new(5.6 if few else 7.4, 4.8 if few else 6.6)
-    axis = figure.subplots()
-    shown = axis.imshow(matrix, vmin=-1, vmax=1, cmap="RdBu_r", interpolation="nearest")
-    if few:
-        ticks, labels = list(map(float, range(len(names)))), [_short(name) for name in names]
-        for i in range(len(names)):
-            for j in range(len(names)):
-                strong = abs(matrix[i, j]) > 0.6
-                axis.text(j, i, f"{matrix[i, j]:.2f}", ha="center", va="center", fontsize=7,
-                          color="white" if strong else "black")  # fmt: skip
-    else:
-        groups = _groups(names)
-        ticks, labels = [(a + b) / 2 - 0.5 for a, b in groups.values()], list(groups)
-        for a, _ in groups.values():
-            axis.axhline(a - 0.5, color="0.4", lw=0.5)
-            axis.axvline(a - 0.5, color="0.4", lw=0.5)
-    axis.set_xticks(ticks, labels, rotation=45, ha="right", fontsize=7)
-    axis.set_yticks(ticks, labels, fontsize=7)
-    axis.set_title(title)
-    figure.colorbar(shown, ax=axis, shrink=0.8)
-    return figure
+def _arrow_scale(arrows: np.ndarray, width_px: int) -> float:
+    """What a pixel of the drawing is of a residual (n, 2), the typical one `ARROW_PART` long."""
+    typical = float(np.sqrt(np.mean(np.sum(arrows**2, axis=1)))) if len(arrows) else 0.0
+    return max(typical, 1e-9) / (ARROW_PART * width_px)
 
 
-def pointing_map(found: PointingMap, calibration: Calibration, what: str) -> Any:
-    """Draw a map over pan and tilt, both ways of naming a target, with the survey's own joint angles."""
-    figure = plots.new(11.5, 3.9)
-    axes = figure.subplots(1, 2, sharey=True)
-    joints = {
-        (image.pan_rad, image.tilt_rad)
-        for image in calibration.images
-        if image.pan_rad is not None and image.tilt_rad is not None and image.used.any()
-    }
-    for axis, values, title in (
-        (axes[0], found.by_click, "clicked in the pair, off the middle"),
-        (axes[1], found.by_position, "given as a position in the rover frame"),
-    ):
-        pan, tilt = np.degrees(found.pan_rad), np.degrees(found.tilt_rad)
-        shown = axis.pcolormesh(pan, tilt, values, shading="nearest", cmap="viridis")
-        figure.colorbar(shown, ax=axis, label=f"{what}, px")
-        if np.isfinite(values).any() and np.nanmax(values) > 1.0001 * np.nanmin(values):
-            lines = axis.contour(pan, tilt, values, colors="white", linewidths=0.7)
-            axis.clabel(lines, fontsize=7)
-        if joints:
-            axis.scatter(*np.degrees(np.array(sorted(joints))).T, s=12, c="white", edgecolors="black", lw=0.5)
-        axis.set(xlabel="pan, deg", title=f"{found.camera}, {found.range_m:g} m: {title}")
-        axis.title.set_fontsize(9)
-    axes[0].set_ylabel("tilt, deg")
-    return figure
+def _of_camera(fit: FittedRig, camera: str, check: bool = False) -> list[ImageResiduals]:
+    return [i for i in fit.images if i.camera == camera and (i.purpose == "check") == check]
 
 
-def dots_of(images: Sequence[ImageResiduals], which: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return pixels (n, 2) and residuals (n, 2) of those dots of images that ``which`` picks, by a mask."""
-    places = [image.pixels_px[which(image)] for image in images]
-    arrows = [image.residuals_px[which(image)] for image in images]
-    if not places:
-        return np.empty((0, 2)), np.empty((0, 2))
-    return np.concatenate(places), np.concatenate(arrows)
-
-
-def _image_rms(image: ImageResiduals) -> float:
-    return float(np.sqrt(np.mean(image.residuals_px[told(image)] ** 2)))
-
-
-def told(image: ImageResiduals) -> np.ndarray:
-    """Return which of an image's dots count: all of a check image, of others those that were fitted."""
+def _counted(image: ImageResiduals) -> np.ndarray:
+    """Which of an image's dots count: all of a check image, of others those that were fitted."""
     return np.ones(len(image.used), dtype=bool) if image.purpose == "check" else image.used
 
 
-def _eyes(rig: Rig, plan: Any, side: Any) -> None:
-    """The cameras with the head straight ahead, and the mast's foot of the pan axis."""
-    for index, name in enumerate(rig.cameras):
-        model = rig.camera_in_rover(name, 0.0, 0.0)
-        ahead = Rigid(np.eye(3), model.C).points(0.8 * np.asarray(model.A))
-        for axis, (across, up) in ((plan, (1, 0)), (side, (0, 2))):
-            axis.plot([model.C[across], ahead[across]], [model.C[up], ahead[up]], lw=1,
-                      color="black", label="cameras at pan 0, tilt 0" if index == 0 else None)  # fmt: skip
-            axis.plot(model.C[across], model.C[up], "k.", ms=4)
+def _dots(images: Sequence[ImageResiduals]) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (n, 2) and residuals (n, 2) of the dots of images that count."""
+    places = [image.pixels_px[_counted(image)] for image in images]
+    arrows = [image.residuals_px[_counted(image)] for image in images]
+    return np.concatenate([np.empty((0, 2)), *places]), np.concatenate([np.empty((0, 2)), *arrows])
 
 
-def _short(name: str) -> str:
-    """``mast.translation_m.x`` as ``t x``."""
-    words: Mapping[str, str] = {"translation_m": "t", "rotation_rad": "θ"}
-    _, key, *axis = name.split(".")
-    return " ".join([words.get(key, key), *axis])
+def _degrees(angle_rad: float | None) -> float | None:
+    return None if angle_rad is None else float(np.degrees(angle_rad))
 
 
-def _groups(names: Sequence[str]) -> dict[str, tuple[int, int]]:
-    """First and last + 1 index of the mast's and of each camera's parameters."""
-    groups: dict[str, tuple[int, int]] = {}
-    for index, name in enumerate(names):
-        first, second, *_ = name.split(".")
-        group = first if first == "mast" else second
-        groups[group] = (groups.get(group, (index, 0))[0], index + 1)
-    return groups
+def _mean(image: ImageResiduals, part: int) -> tuple[float, float]:
+    """Mean residual of an image and its sigma, were its corners independent."""
+    values = image.residuals_px[_counted(image), part]
+    return float(values.mean()), float(values.std() / np.sqrt(len(values)))
+
+
+def _rms(image: ImageResiduals) -> float:
+    return float(np.sqrt(np.mean(image.residuals_px[_counted(image)] ** 2)))
+
+
+def _curve_sigma(
+    known: RigCovariance, joint: str, model: AxisJoint, read: FloatArray, approach: FloatArray
+) -> FloatArray:
+    """One sigma of a joint's curve; of numbers that were not fitted nothing is unsure."""
+    names = [name for name in JOINTS_NAMES if name.startswith(f"joints.{joint}.")]
+    rates = model.rates(read, approach)
+    inside = known.among(names)
+    return np.asarray(np.sqrt(np.maximum(np.einsum("ip,pq,iq->i", rates, inside, rates), 0.0)))
+
+
+def _by_joint(fit: BenchCalibration, survey: Survey, joint: str) -> list[tuple[float, float, int]]:
+    """Each head image's reading, what it says the reading is wrong by, and the side it came from."""
+    out = []
+    part = 0 if joint == "pan" else 1
+    sides = {image.name: int(getattr(image, f"{joint}_approach")) for image in survey.images}
+    model: AxisJoint = getattr(fit.rig.joints, joint)
+    for image in fit.images:
+        read = image.pan_rad if joint == "pan" else image.tilt_rad
+        if read is None or image.purpose == "check" or not image.used.any():
+            continue
+        focal_px = fit.rig.cameras[image.camera].model.focal_px[part]
+        shrunk = np.cos(image.tilt_rad or 0.0) if joint == "pan" else 1.0
+        # A head that truly turned further right shows everything further left: predicted less measured grows.
+        sign = 1.0 if joint == "pan" else -1.0
+        mean = float(np.mean(image.residuals_px[image.used, part]))
+        wrong = float(model.true_rad(read, sides[image.name])) - read
+        out.append((read, wrong + sign * mean / (focal_px * max(shrunk, 0.2)), sides[image.name]))
+    return out

@@ -1,25 +1,34 @@
-"""Where a target lands when a rig is believed that is not quite the true one, and how sure that is over the
-joints.
+"""Where a target lands that a rig points at: by another rig that is the true one, or by its uncertainty.
 
-What the daemon does with a click: two pixels of a stereo pair, triangulated and pointed at by the believed
-rig. What happens then is by the true one. The paper's sections IV and V, without a renderer.
+A pointing as the daemon does it: two pixels of a stereo pair, triangulated and pointed at by the believed
+rig. Where the target lands then is by the true one. The paper's sections IV and V, without a renderer.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.adjust.result import Calibration
-from calib.adjust.uncertainty import pixel_covariance, pointing_covariance
+from calib.adjust.result import Calibration, FittedRig
+from calib.adjust.uncertainty import pointing_covariance
 from calib.errors import CalibError
+from calib.geometry.covariance import RigCovariance
 from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import triangulate
+from calib.plan.knowledge import ExpectedPointing, Knowledge, Workspace, pointing
+from mastctl.errors import MastctlError
+
+POINTING_RANGE_M = 6.0
+
+NEAR_CORNERS = ((0.2, 0.2), (0.8, 0.2), (0.2, 0.8), (0.8, 0.8))
+"""Where targets are clicked, as part of the image's width and height: off the middle."""
+
+PANS_RAD, TILTS_RAD = (-2.0, -1.0, 0.0, 1.0, 2.0), (-0.9, -0.4, 0.1, 0.6)
+"""Joint angles at which two rigs are compared."""
 
 
 def click(
@@ -133,95 +142,91 @@ def handoff_errors_px(
     return errors
 
 
-PAN_RAD = (-2.6, 2.6)
-TILT_RAD = (-1.2, 0.7)
-STEPS = (27, 15)
+def first_cameras(rig: Rig) -> tuple[str, ...]:
+    """Return the cameras that point: the Navcam pair, else a pair on the head, else one camera.
 
-CORNER = (0.2, 0.25)
-"""Where a click is taken to be, as part of the image's width and height: off the middle."""
-
-
-@dataclass(frozen=True, eq=False)
-class PointingMap:
-    """Pixels over pan (n,) and tilt (m,), radians: ``by_click`` and ``by_position`` (m, n).
-
-    ``by_click``: a target clicked in the stereo pair at these joint angles; it is the same at every pan,
-    since all of it happens beyond the pan axis. ``by_position``: a target whose place in the rover frame is
-    given. Not-a-number where there is no answer.
+    Raises
+    ------
+    MastctlError
+        If no camera is on the head.
     """
-
-    pair: str
-    camera: str
-    range_m: float
-    pan_rad: FloatArray
-    tilt_rad: FloatArray
-    by_click: FloatArray
-    by_position: FloatArray
-
-
-def uncertainty_map(calibration: Calibration, pair: str, range_m: float) -> PointingMap:
-    """Return the sigma (rms per axis, px) that the calibration alone gives to pointing, over the joints."""
-    names = calibration.rig.stereo[pair]
-    middle = np.array(calibration.rig.cameras[names[0]].model.image_center_px)
-    corner = _corner(calibration.rig, names[0])
-
-    def by_click(tilt: float) -> float:
-        return _rms(pointing_covariance(calibration, names, 0.0, tilt, corner, range_m))
-
-    def by_position(pan: float, tilt: float) -> float:
-        rays = calibration.rig.camera_in_rover(names[0], pan, tilt).ray(middle)
-        target = rays.origins_m + range_m * rays.directions
-        return _rms(pixel_covariance(calibration, names[0], pan, tilt, target[None])[1][0])
-
-    return _map(pair, names[0], range_m, by_click, by_position)
+    pairs = {n: p for n, p in rig.stereo.items() if all(rig.cameras[c].on == "head" for c in p)}
+    if pairs:
+        return pairs.get("navcam") or next(iter(pairs.values()))
+    single = [name for name, camera in rig.cameras.items() if camera.on == "head"]
+    if not single:
+        raise MastctlError("the mast file has no camera on the head, and so no head to calibrate")
+    return (single[0],)
 
 
-def change_map(new: Rig, old: Rig, pair: str, range_m: float) -> PointingMap | None:
-    """Return by how many pixels pointing would change (length of the shift), over the joints.
+def expected_pointing(fit: FittedRig) -> tuple[ExpectedPointing, FloatArray] | None:
+    """Return how first pointings depend on a fitted rig's numbers, and their covariance.
 
-    The new rig is taken as true. None where the old rig has no such cameras on its head.
+    Over the angles at which boards were seen, targets at 2, 6 and 10 m, clicked in the first pair of the head
+    (or its first camera, the range given). None if nothing can be pointed at.
     """
-    names = new.stereo[pair]
-    if any(name not in old.cameras or old.cameras[name].on != "head" for name in names):
-        return None
-    middle = np.array(new.cameras[names[0]].model.image_center_px)
-
-    def by_click(tilt: float) -> float:
-        target, left, right = click(new, names, 0.0, tilt, _corner(new, names[0]), range_m)
-        return float(np.linalg.norm(pointing_error_px(old, new, names, 0.0, tilt, target, left, right)))
-
-    def by_position(pan: float, tilt: float) -> float:
-        rays = new.camera_in_rover(names[0], pan, tilt).ray(middle)
-        target = rays.origins_m + range_m * rays.directions
-        return float(np.linalg.norm(position_error_px(old, new, names[0], pan, tilt, target, target)))
-
-    return _map(pair, names[0], range_m, by_click, by_position)
-
-
-def _map(
-    pair: str,
-    camera: str,
-    range_m: float,
-    by_click: Callable[[float], float],
-    by_position: Callable[[float, float], float],
-) -> PointingMap:
-    pans, tilts = np.linspace(*PAN_RAD, STEPS[0]), np.linspace(*TILT_RAD, STEPS[1])
-    clicked = np.array([_or_nan(by_click, float(tilt)) for tilt in tilts])
-    placed = np.array([[_or_nan(by_position, float(pan), float(tilt)) for pan in pans] for tilt in tilts])
-    return PointingMap(pair, camera, range_m, pans, tilts, np.tile(clicked[:, None], len(pans)), placed)
-
-
-def _or_nan(value: Callable[..., float], *joints_rad: float) -> float:
+    readings = np.array([(i.pan_rad, i.tilt_rad) for i in fit.images if i.pan_rad is not None], dtype=float)
+    low, high = readings.min(axis=0).tolist(), readings.max(axis=0).tolist()
+    known = Knowledge(fit.rig, {})
+    where = Workspace(first_cameras(fit.rig), (low[0], high[0]), (low[1], high[1]))
     try:
-        return value(*joints_rad)
+        landings = pointing(known, where)
     except CalibError:
-        return float("nan")
+        return None
+    return landings, RigCovariance(fit.parameter_names, fit.covariance).among(known.names)
 
 
-def _corner(rig: Rig, camera: str) -> FloatArray:
-    width, height = rig.cameras[camera].model.size_px
-    return np.array([CORNER[0] * width, CORNER[1] * height])
+def pointing_sigma_px(fit: Calibration, pair: tuple[str, str]) -> float | None:
+    """Return the sigma (rms per axis, pixels) of pointing at targets clicked near the image's corners.
+
+    None if no such target can be pointed at.
+    """
+    size_px = np.array(fit.rig.cameras[pair[0]].model.size_px)
+    seen = [i for i in fit.images if i.camera == pair[0] and i.pan_rad is not None]
+    pan = float(np.median([i.pan_rad for i in seen])) if seen else 0.0
+    tilt = float(np.median([i.tilt_rad for i in seen])) if seen else 0.0
+    variances = []
+    for corner in NEAR_CORNERS:
+        try:
+            covariance = pointing_covariance(fit, pair, pan, tilt, size_px * corner, POINTING_RANGE_M)
+        except CalibError:
+            continue
+        variances.append(np.trace(covariance) / 2)
+    return float(np.sqrt(np.mean(variances))) if variances else None
 
 
-def _rms(covariance: FloatArray) -> float:
-    return float(np.sqrt(np.trace(covariance) / 2))
+def pointing_change(new: Rig, old: Rig) -> dict[str, dict[str, float]]:
+    """Return by pair of the head by how many pixels pointing would change, median and most over the joints.
+
+    ``median_px``, ``most_px``: of a target clicked near a corner, `POINTING_RANGE_M` away;
+    ``position_median_px``, ``position_most_px``: of one whose place in the rover frame is given. The new rig
+    is treated as the true one. Pairs that the old rig does not have are left out.
+    """
+    found = {}
+    for pair, names in new.stereo.items():
+        if any(rig.cameras[n].on != "head" for rig in (new, old) for n in names if n in rig.cameras):
+            continue
+        if any(name not in old.cameras for name in names):
+            continue
+        size_px = np.array(new.cameras[names[0]].model.size_px)
+        clicked, placed = [], []
+        for tilt in TILTS_RAD:
+            for pan in PANS_RAD:
+                try:
+                    target, left, right = click(
+                        new, names, pan, tilt, size_px * NEAR_CORNERS[0], POINTING_RANGE_M
+                    )
+                    off_px = pointing_error_px(old, new, names, pan, tilt, target, left, right)
+                    clicked.append(np.linalg.norm(off_px))
+                    off_px = position_error_px(old, new, names[0], pan, tilt, target, target)
+                    placed.append(np.linalg.norm(off_px))
+                except CalibError:
+                    continue
+        if placed:
+            found[pair] = {
+                "median_px": float(np.median(clicked)),
+                "most_px": float(np.max(clicked)),
+                "position_median_px": float(np.median(placed)),
+                "position_most_px": float(np.max(placed)),
+            }
+    return found

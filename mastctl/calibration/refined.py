@@ -23,8 +23,7 @@ from calib.files.mast_file import StoredRig
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
 from calib.matching.handed_over import HandoffBias, MatchedHandoff, handoff_bias
-from mastctl.calibration.mast_file import rounded_matrix, with_correction
-from mastctl.calibration.run import save_new
+from mastctl.calibration.mast_file import rounded_matrix, save_new, with_correction
 from mastctl.watch.handoffs import ReadLog
 
 SHIFT_FIRST = (3, 4, 5, 0, 1, 2)

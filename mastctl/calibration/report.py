@@ -2,229 +2,256 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calib.adjust.result import HELD_FIXED, Calibration
+from calib.adjust.result import HELD_FIXED, BenchCalibration, Calibration, FittedRig
 from calib.files.atomic import save_bytes
 from calib.files.mast_file import StoredRig
+from calib.geometry.rig import Rig
+from calib.survey.records import Survey
 from mastctl.as_json import readable
 from mastctl.calibration import drawn
-from mastctl.calibration.landing import change_map, uncertainty_map
-from mastctl.calibration.run import Calibrated
-from mastctl.calibration.tested import component_table, finding_table
-from mastctl.calibration.verdict import POINTING_RANGE_M
+from mastctl.calibration.differences import rig_differences
+from mastctl.calibration.landing import expected_pointing, pointing_change
+from mastctl.calibration.reasons import CalibrationVerdict
+from mastctl.calibration.sigmas import finding_table, sigma_table
 from mastctl.report import pages, plots
 from mastctl.report.pictures import Figure
-from mastctl.report.tables import Table, x_y
+from mastctl.report.tables import Table, number, x_y
+
+AnyFit = Calibration | BenchCalibration
 
 WORST_IMAGES = 12
 
 
-def write_calibration_report(told: Calibrated, in_use: StoredRig | None, folder: Path) -> Path:
-    """Write calibration.html into ``folder`` (made if need be) in one step and return it.
+def write_report(
+    folder: Path,
+    file: str,
+    survey: Survey,
+    fit: AnyFit,
+    verdict: CalibrationVerdict,
+    saved: StoredRig,
+    former: Rig | None,
+    promised_px: Mapping[str, float] | None = None,
+    **own: Any,
+) -> Path:
+    """Write the page into ``folder`` (made if need be) in one step and return it.
 
-    It compares with the mast file ``in_use``, if there is one. A report that was there is kept as
-    calibration.previous.html.
+    A page that was there is kept as ``NAME.previous.html``.
+
+    Parameters
+    ----------
+    former
+        The rig to compare with.
+    promised_px
+        What the fit promised of images that were not fitted, rms per axis by camera.
+    own
+        ``worth``, ``pointings``: tables of a bench; ``warnings``, ``undetected``: sentences of a survey.
 
     Raises
     ------
     OSError, BadFile
         If it cannot be written; then the file is as it was.
     """
-    page = readable(_page(told, in_use)).encode()
+    if isinstance(fit, BenchCalibration):
+        title, method = "Bench calibration", "bench"
+        parts: dict[str, Any] = {"terms": _terms(fit), "wider": None, "station": None}
+    else:
+        title, method = "Mast calibration", f"{fit.method}, {fit.mast_parameters} mast parameters"
+        wider, station = finding_table("wider model", fit.wider), _station_table(fit)
+        parts = {"terms": None, "wider": wider, "station": station}
+    date = str(saved.rig.provenance.get("date", "")).replace("T", " ").replace("+00:00", " UTC")
+    page = pages.page(
+        "calibration.html",
+        title=title,
+        badge=pages.Badge(verdict.words.upper(), verdict.grade),
+        facts=[
+            ("survey", survey.folder.resolve().name),
+            ("digest", survey.digest[:12]),
+            ("method", method),
+            ("mast file", f"{saved.path.name} ({saved.digest[:12]})"),
+            ("fitted in", f"{fit.seconds:.1f} s"),
+            ("made", f"{date} by {saved.rig.provenance.get('program')}"),
+        ],
+        reasons=[(pages.Badge(one.grade, one.grade), one.sentence) for one in verdict.reasons],
+        mast=mast_table(fit),
+        cameras=camera_table(fit, promised_px),
+        measurements=sigma_table(survey, fit),
+        boards=finding_table("placement", fit.contradictions),
+        notes=fit.notes,
+        held_fixed=fit.gauges if isinstance(fit, BenchCalibration) else HELD_FIXED,
+        left_out=[outlier.sentence for outlier in fit.outliers],
+        plots=list(_plots(survey, fit, former)) if plots.installed() else None,
+        changes=[] if former is None else list(_changes(fit.rig, former)),
+        worst_images=_worst_images(fit),
+        **parts,
+        **{"worth": None, "pointings": None, "warnings": (), "undetected": (), **own},
+    )
     folder.mkdir(parents=True, exist_ok=True)
-    path = folder / "calibration.html"
-    save_bytes(path, page)
+    path = folder / file
+    save_bytes(path, readable(page).encode())
     return path
 
 
-def mast_table(calibration: Calibration) -> Table:
+def mast_table(fit: FittedRig) -> Table:
     """Return the mast's parameters with their sigmas, one row each."""
-    mast, sigma = calibration.rig.mast, calibration.sigma["mast"]
-    rows = []
-    for key, unit, word in (("translation_m", "m", "t"), ("rotation_rad", "rad", "θ")):
-        for index, axis in enumerate("xyz"):
-            value, spread = getattr(mast, key)[index], sigma[key][index]
-            rows.append([f"{word}{axis}", f"{value:+.5f} {unit}", _spread(spread, unit)])
-    if calibration.mast_parameters == 8:
-        for key, unit in (("axis_offset_m", "m"), ("axis_twist_rad", "rad")):
-            rows.append([key, f"{getattr(mast, key):+.5f} {unit}", _spread(sigma[key], unit)])
+    mast, sigma = fit.rig.mast, fit.sigma["mast"]
+
+    def row(name: str, value: float, spread: float, unit: str) -> list[str]:
+        fixed = spread == 0.0
+        return [name, f"{value:+.5f} {unit}", "not fitted" if fixed else f"± {1000 * spread:.2f} m{unit}"]
+
+    rows = [
+        row(f"{letter}{axis}", getattr(mast, key)[index], sigma[key][index], unit)
+        for key, unit, letter in (("translation_m", "m", "t"), ("rotation_rad", "rad", "θ"))
+        for index, axis in enumerate("xyz")
+    ]
+    for key, unit in (("axis_offset_m", "m"), ("axis_twist_rad", "rad")):
+        if sigma[key] > 0.0:
+            rows.append(row(key, getattr(mast, key), sigma[key], unit))
     return Table(("parameter", "value", "sigma"), rows)
 
 
-def camera_table(calibration: Calibration) -> Table:
+def camera_table(fit: FittedRig, promised_px: Mapping[str, float] | None = None) -> Table:
     """Return the cameras: images, dots, rms of the fit x and y, rms of check images x and y."""
     rows = []
-    for name in calibration.rig.cameras:
-        mine = [i for i in calibration.images if i.camera == name and i.purpose != "check" and i.used.any()]
-        checks = [i for i in calibration.images if i.camera == name and i.purpose == "check"]
-        fitted, check = calibration.rms_px.get(name), calibration.check_rms_px.get(name)
+    for name in fit.rig.cameras:
+        mine = [i for i in fit.images if i.camera == name and i.purpose != "check" and i.used.any()]
+        checks = [i for i in fit.images if i.camera == name and i.purpose == "check"]
         rows.append(
             [
                 name,
                 f"{len(mine)}",
                 f"{sum(int(i.used.sum()) for i in mine)}",
-                x_y(fitted, 3),
+                x_y(fit.rms_px.get(name), 3),
                 f"{len(checks)}",
-                x_y(check, 3),
+                x_y(fit.check_rms_px.get(name), 3),
+                *([] if promised_px is None else [number(promised_px.get(name), 3)]),
             ]
         )
-    return Table(("camera", "images", "dots", "rms x, y px", "checks", "check rms x, y px"), rows)
+    headings = ("camera", "images", "dots", "rms x, y px", "checks", "check rms x, y px")
+    return Table((*headings, *([] if promised_px is None else ["promised px"])), rows)
 
 
-def _spread(sigma: float, unit: str) -> str:
-    if sigma == 0.0:
-        return "not fitted"
-    return f"± {1000 * sigma:.2f} m{unit}"
+def _plots(survey: Survey, fit: AnyFit, former: Rig | None) -> Iterable[tuple[str, Figure]]:
+    """Every plot, with its heading."""
+    for heading, figure, alt, caption in _drawn(survey, fit, former):
+        yield heading, plots.plot(figure, alt, caption, "map" if alt.startswith("maps") else "lines")
 
 
-def _page(told: Calibrated, in_use: StoredRig | None) -> str:
-    calibration, survey, verdict = told.calibration, told.survey, told.verdict
-    return pages.page(
-        "calibration.html",
-        title="Mast calibration",
-        badge=pages.Badge(verdict.words.upper(), verdict.grade),
-        facts=[
-            ("survey", survey.folder.resolve().name),
-            ("digest", survey.digest[:12]),
-            ("method", f"{calibration.method}, {calibration.mast_parameters} mast parameters"),
-            ("mast file", f"{told.saved.path.name} ({told.saved.digest[:12]})"),
-            ("fitted in", f"{calibration.seconds:.1f} s"),
-            ("made", f"{_when(told.saved)} by {told.saved.rig.provenance.get('program')}"),
-        ],
-        reasons=[(pages.Badge(one.grade, one.grade), one.sentence) for one in verdict.reasons],
-        mast=mast_table(calibration),
-        cameras=camera_table(calibration),
-        measurements=component_table(survey, calibration),
-        wider=finding_table("wider model", calibration.wider),
-        boards=finding_table("placement", calibration.contradictions),
-        notes=calibration.notes,
-        held_fixed=HELD_FIXED,
-        warnings=told.warnings,
-        left_out=[outlier.sentence for outlier in calibration.outliers],
-        undetected=[f"{name}: {reason}" for name, reason in told.undetected],
-        plots=_plots(told, in_use) if plots.installed() else None,
-        station=_station_table(calibration),
-        worst_images=_worst_images(calibration),
+def _drawn(survey: Survey, fit: AnyFit, former: Rig | None) -> Iterable[tuple[str, Any, str, str]]:
+    """Heading, figure, what it shows for those who cannot see it, caption."""
+    cameras = [name for name in fit.rig.cameras if any(i.camera == name for i in fit.images)]
+    yield (
+        "Where in the images the board was seen",
+        drawn.coverage(fit, cameras),
+        "maps of the corners over each camera's image",
+        "Corners in cells of the image; gray cells have seen none, and the lens is extrapolated there.",
     )
-
-
-def _when(saved: StoredRig) -> str:
-    """The date of the mast file as a person writes it."""
-    date = str(saved.rig.provenance.get("date", ""))
-    return date.replace("T", " ").replace("+00:00", " UTC")
-
-
-def _plots(told: Calibrated, in_use: StoredRig | None) -> dict[str, Any]:
-    """Every plot, by the name that the template has for it."""
-    calibration = told.calibration
-    pairs = [p for p, c in calibration.rig.stereo.items() if calibration.rig.cameras[c[0]].on == "head"]
-    uncertainties = []
-    for name in pairs:
-        made = drawn.pointing_map(uncertainty_map(calibration, name, POINTING_RANGE_M), calibration, "sigma")
-        uncertainties.append(plots.plot(made, f"uncertainty of {name}", kind="map"))
-    return {
-        "residuals": [
-            plots.plot(drawn.residuals(calibration, name), f"residuals of {name}", _mean(told, name))
-            for name in calibration.rig.cameras
-        ],
-        "boards": plots.plot(drawn.boards(calibration, told.survey.board), "boards in plan and side view"),
-        "errors": plots.plot(drawn.errors_by(calibration), "rms of images over range, angle, pan and tilt"),
-        "correlations": _correlations(calibration),
-        "uncertainties": uncertainties,
-        "change": None if in_use is None else _change(calibration, in_use, pairs),
-    }
-
-
-def _correlations(calibration: Calibration) -> list[Figure]:
-    """Of the mast's parameters, where it was fitted, and of all."""
-    mast, names = calibration.part("mast."), calibration.parameter_names
-    found = []
-    if len(mast):
-        mine = calibration.covariance[np.ix_(mast, mast)]
-        made = drawn.correlation([names[i] for i in mast], mine, "mast")
-        found.append(plots.plot(made, "correlation of mast parameters", "Mast parameters."))
-    caption = "All parameters. Directions that the prisms leave open turn mast and cameras together."
-    made = drawn.correlation(names, calibration.covariance, "mast and cameras")
-    return [*found, plots.plot(made, "correlation of all parameters", caption)]
-
-
-def _change(calibration: Calibration, in_use: StoredRig, pairs: Sequence[str]) -> dict[str, Any]:
-    """By how many pixels pointing would change against the mast file in use."""
-    rows, maps = [], []
-    for name in pairs:
-        change = change_map(calibration.rig, in_use.rig, name, POINTING_RANGE_M)
-        if change is None:
-            rows.append([name, "", "", "the mast file in use lacks these cameras"])
-            continue
-        rows.append([name, _typical(change.by_click), _typical(change.by_position), ""])
-        maps.append(
-            plots.plot(drawn.pointing_map(change, calibration, "change"), f"change of {name}", kind="map")
+    yield (
+        "Residuals over the images",
+        drawn.residuals(fit, cameras),
+        "residual arrows over each camera's image",
+        "Predicted less measured. They should look like noise: arrows that grow to the corners are the "
+        "lens's, arrows that all point one way in an image a joint's, a tape's or a prism's.",
+    )
+    yield (
+        "Residuals by joint angle, distance and angle of the board",
+        drawn.over_images(fit, cameras),
+        "mean residual of each image over pan and tilt, rms over range and angle",
+        "An error of a joint moves whole images: pan in x, tilt in y. A wave is a harmonic, two levels are "
+        "backlash. Triangles: images that were not fitted.",
+    )
+    if isinstance(fit, BenchCalibration):
+        yield (
+            "Errors of the joints",
+            drawn.joint_curves(fit, survey),
+            "true less read angle over each joint's reading",
+            "The fitted curve with its 95 % band, and what each image says of it (one point an image).",
         )
-    table = Table(("pair", "clicked, px", "position in the rover frame, px", ""), rows)
-    return {"file": f"{in_use.path.name} ({in_use.digest[:12]})", "table": table, "maps": maps}
+    else:
+        yield (
+            "Where the boards stood",
+            drawn.boards(fit, survey.board),
+            "boards in plan and side view",
+            "In the rover frame, so boards that the rover saw while it was tilted back stand low. Boards for "
+            "the mast and for checks are named where there is space.",
+        )
+    yield (
+        "How sure projection is over the images",
+        drawn.lens_uncertainty(fit, cameras),
+        "maps of the uncertainty of projection",
+        "95 % of a pixel of a target 5 m away.",
+    )
+    expected = expected_pointing(fit)
+    if expected is not None:
+        yield (
+            "How sure pointing is over the workspace",
+            drawn.workspace(*expected, fit),
+            "maps of the predicted pointing error over pan and tilt",
+            "One sigma an axis of a first pointing, by the calibration; dots are images.",
+        )
+    found = [] if former is None else list(rig_differences(fit.rig, former))
+    if found:
+        yield (
+            "How each lens differs from the former mast file's",
+            drawn.differences(found, fit.rig),
+            "arrows between the new and the former model of each lens",
+            "Where the new model sees what the former one saw at a pixel, the implied motion taken out.",
+        )
 
 
-def change_summary(calibration: Calibration, in_use: StoredRig) -> dict[str, dict[str, float]]:
-    """Return by pair the median and largest change of pointing, px, against the mast file in use."""
-    summary = {}
-    for pair, names in calibration.rig.stereo.items():
-        if calibration.rig.cameras[names[0]].on != "head":
-            continue
-        change = change_map(calibration.rig, in_use.rig, pair, POINTING_RANGE_M)
-        if change is not None and np.isfinite(change.by_click).any():
-            summary[pair] = {
-                "median_px": float(np.nanmedian(change.by_click)),
-                "most_px": float(np.nanmax(change.by_click)),
-                "position_median_px": float(np.nanmedian(change.by_position)),
-                "position_most_px": float(np.nanmax(change.by_position)),
-            }
-    return summary
+def _changes(rig: Rig, former: Rig) -> Iterable[str]:
+    """By how much cameras and pointing differ from the former mast file."""
+    yield from (one.sentence for one in rig_differences(rig, former))
+    for pair, change in pointing_change(rig, former).items():
+        yield (
+            f"pointing {pair} at what was clicked would change by {change['median_px']:.2f} px, at most "
+            f"{change['most_px']:.2f}; at a position in the rover frame by "
+            f"{change['position_median_px']:.2f} px, at most {change['position_most_px']:.2f}"
+        )
 
 
-def _typical(values: np.ndarray) -> str:
-    if not np.isfinite(values).any():
-        return "none"
-    return f"{np.nanmedian(values):.2f}, at most {np.nanmax(values):.2f}"
+def _terms(fit: BenchCalibration) -> Table:
+    rows = []
+    for term in fit.terms:
+        size = float(np.linalg.norm(term.values))
+        spread = float(np.sqrt(np.mean(term.sigma**2))) if len(term.sigma) else 0.0
+        length = any(name.endswith("_m") or ".bow_m" in name for name in term.parameters)
+        rows.append(
+            [
+                term.name,
+                "in" if term.entered else "left out",
+                f"{1e3 * size:.2f} ± {1e3 * spread:.2f} {'mm' if length else 'mrad'}",
+                f"{term.moves_px:.2f}" if term.entered else "",
+                f"{term.chi2:.1f}",
+            ]
+        )
+    return Table(("term", "", "size", "moves pixels by, rms px", "chi-square gained"), rows)
 
 
-def _mean(told: Calibrated, camera: str) -> str:
-    fitted = told.calibration.rms_px.get(camera)
-    check = told.calibration.check_rms_px.get(camera)
-    words = [f"fitted {x_y(fitted, 3)} px rms"] if fitted else []
-    words += [f"check {x_y(check, 3)} px rms"] if check else []
-    return f"{camera}: " + ", ".join(words)
-
-
-def _station_table(calibration: Calibration) -> Table:
+def _station_table(fit: Calibration) -> Table:
     """Rms of the residuals of prisms by set-up and of tapes by placement, worst first."""
     groups: dict[tuple[str, str, str], list[float]] = {}
-    for point in calibration.station:
-        size = 1000 * float(np.linalg.norm(point.residual_m))
-        groups.setdefault((point.kind, point.setup, point.placement), []).append(size)
+    for point in fit.station:
+        size_mm = 1000 * float(np.linalg.norm(point.residual_m))
+        groups.setdefault((point.kind, point.setup, point.placement), []).append(size_mm)
     rows = [
-        [
-            kind,
-            setup,
-            placement,
-            f"{len(sizes)}",
-            f"{np.sqrt(np.mean(np.square(sizes))):.2f}",
-            f"{max(sizes):.2f}",
-        ]
-        for (kind, setup, placement), sizes in groups.items()
+        [*group, f"{len(sizes)}", f"{np.sqrt(np.mean(np.square(sizes))):.2f}", f"{max(sizes):.2f}"]
+        for group, sizes in groups.items()
     ]
     rows.sort(key=lambda row: (row[0], -float(row[5])))
     return Table(("kind", "set-up", "placement", "points", "rms mm", "worst mm"), rows)
 
 
-def _worst_images(calibration: Calibration) -> Table:
+def _worst_images(fit: FittedRig) -> Table:
     """The images that fit worst."""
     sizes = []
-    for image in calibration.images:
+    for image in fit.images:
         which = image.used if image.purpose != "check" else np.ones(len(image.used), dtype=bool)
         if which.any():
             rms_px = float(np.sqrt(np.mean(image.residuals_px[which] ** 2)))
@@ -242,6 +269,5 @@ def _worst_images(calibration: Calibration) -> Table:
         ]
         for rms, image in sizes[:WORST_IMAGES]
     ]
-    return Table(
-        ("rms px", "range m", "turned deg", "dots out", "purpose", "set-up / placement", "image"), rows
-    )
+    headings = ("rms px", "range m", "turned deg", "dots out", "purpose", "set-up / placement", "image")
+    return Table(headings, rows)

@@ -11,13 +11,12 @@ from calib.adjust.result import Calibration
 from calib.calibrate.paper import fit_paper
 from calib.calibrate.survey import fit_joint
 from calib.errors import CalibError
-from calib.files.atomic import keep_previous, previous_path
-from calib.files.mast_file import StoredRig, save_rig
-from calib.geometry.rig import Rig
+from calib.files.mast_file import StoredRig
 from calib.survey.check import check_survey
 from calib.survey.records import Survey, SurveyFinding
-from mastctl.calibration.mast_file import with_survey_fit
-from mastctl.calibration.verdict import CalibrationVerdict, judge_calibration
+from mastctl.calibration.mast_file import save_new, with_fit
+from mastctl.calibration.reasons import CalibrationVerdict
+from mastctl.calibration.verdict import judge
 from mastctl.errors import MastctlError
 
 Method = Literal["paper", "joint"]
@@ -97,8 +96,8 @@ def calibrate(
     """
     calibration = FITS[method](survey, mast_parameters)
     jointly = None if method == "joint" else _jointly(survey, mast_parameters)
-    verdict = judge_calibration(survey, calibration, warnings, [name for name, _ in undetected], jointly)
-    saved, previous = save_new(with_survey_fit(calibration, survey, verdict.told()), out)
+    verdict = judge(survey, calibration, warnings, [name for name, _ in undetected], jointly)
+    saved, previous = save_new(with_fit(calibration, survey, verdict), out)
     sentences = tuple(sentence_of(finding) for finding in warnings)
     return Calibrated(survey, calibration, verdict, sentences, undetected, saved, previous)
 
@@ -109,24 +108,6 @@ def _jointly(survey: Survey, mast_parameters: int) -> Calibration | CalibError:
         return fit_joint(survey, mast_parameters)
     except CalibError as error:
         return error
-
-
-def save_new(rig: Rig, out: Path) -> tuple[StoredRig, Path | None]:
-    """Save a mast file and keep every former version; return it, and the name of the last one.
-
-    Raises
-    ------
-    BadFile
-        If ``out`` cannot be written; it holds what it held before.
-    """
-    was_there = out.exists()
-    kept = keep_previous(out) if was_there else None
-    try:
-        return save_rig(rig, out), previous_path(out) if was_there else None
-    except BaseException:
-        if kept is not None:
-            kept.unlink(missing_ok=True)
-        raise
 
 
 def sentence_of(finding: SurveyFinding) -> str:

@@ -1,34 +1,23 @@
-"""Whether to trust a calibration, and why: a few tests, each one sentence."""
+"""Whether to trust a calibration, by a survey or on the bench, and why: a few tests, each one sentence."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import takewhile
-from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.adjust.goodness import Component, as_one
-from calib.adjust.result import BenchCalibration, Calibration, ImageResiduals
-from calib.adjust.terms import PRISMS, TAPES
-from calib.adjust.uncertainty import pointing_covariance
+from calib.adjust.result import BenchCalibration, Calibration, FittedRig, ImageResiduals
 from calib.errors import CalibError
 from calib.geometry.significance import Level
 from calib.survey.records import Survey, SurveyFinding
 from mastctl.calibration.checks import exchanged_boards
-from mastctl.calibration.tested import allowed, wrong_sentence
+from mastctl.calibration.landing import POINTING_RANGE_M, expected_pointing, pointing_sigma_px
+from mastctl.calibration.reasons import CalibrationVerdict, Grade, Reason
+from mastctl.calibration.sigmas import chi_square_reason, sigma_reasons
 
-Grade = Literal["good", "care", "bad"]
-
-WORDS: Mapping[Grade, str] = {
-    "good": "trust it",
-    "care": "use it with care",
-    "bad": "do not trust it",
-}
-
-POINTING_RANGE_M = 6.0
 POINTING_GOOD_PX = 0.5
 POINTING_BAD_PX = 2.0
 """Rms per axis that the calibration alone may add to pointing at a click; the paper reached 1.3 in all."""
@@ -47,46 +36,13 @@ ODD_IMAGE = 6.0
 
 FEW_IMAGES = 4
 
-UNEXPLAINED = 2.0
-"""Residuals so many times their stated sigmas that no kind of measurement explains are a model's."""
-
-MANY_UNEVEN = 0.25
-"""Share of images noisier than stated above which somebody should look for the cause."""
-
-HOPELESS = 5.0
-"""Measurements that scatter so many times their stated sigma, or by so much less, are not what they are taken
-for."""
+LITTLE = 0.2
+"""Corners that are off by less than this part of ``corner_px`` are no reason for doubt."""
 
 
-@dataclass(frozen=True)
-class Reason:
-    """One test's outcome in words."""
-
-    grade: Grade
-    sentence: str
-
-
-@dataclass(frozen=True)
-class CalibrationVerdict:
-    """The worst of the reasons decides."""
-
-    grade: Grade
-    reasons: tuple[Reason, ...]
-
-    @property
-    def words(self) -> str:
-        """The grade as a person says it."""
-        return WORDS[self.grade]
-
-    def told(self) -> dict[str, object]:
-        """Return it as JSON or YAML."""
-        reasons = [{"grade": reason.grade, "sentence": reason.sentence} for reason in self.reasons]
-        return {"grade": self.grade, "words": self.words, "reasons": reasons}
-
-
-def judge_calibration(
+def judge(
     survey: Survey,
-    calibration: Calibration,
+    fit: Calibration | BenchCalibration,
     warnings: Sequence[SurveyFinding] = (),
     undetected: Sequence[str] = (),
     jointly: Calibration | CalibError | None = None,
@@ -96,158 +52,122 @@ def judge_calibration(
     Parameters
     ----------
     survey
-        With the dots that were fitted.
-    calibration
-        What came of it.
+        With the dots or corners that were fitted.
+    fit
+        The result.
     warnings
-        What the check of the survey warned of. What the joint fit tests again, finer, is left to its tests.
+        The warnings of the survey's check. What the joint fit tests again, finer, is left to its tests.
     undetected
         Names of images in which no dots were found.
     jointly
         The joint fit of a survey that was calibrated by the paper's method, which has no tests of its own; or
         why there is none.
     """
-    reasons = [
-        *_noise(survey, calibration),
-        *_wider(calibration),
-        *contradiction_reasons(calibration),
-        *_jointly(survey, jointly),
-        *_odd_images(calibration),
-        *_checks(calibration),
-        *_open(calibration),
-        *_turned(calibration),
-        *_pointing(calibration),
-        *_left_out(calibration),
-        *_at_the_end(calibration),
-        *(Reason("care", sentence) for sentence in exchanged_boards(survey, calibration)),
-    ]
+    own = (
+        _of_survey(survey, fit, warnings, undetected, jointly)
+        if isinstance(fit, Calibration)
+        else _of_bench(survey, fit)
+    )
+    return CalibrationVerdict.by(
+        [
+            *_noise(survey, fit),
+            *_contradictions(fit),
+            *_checks(fit),
+            *(Reason("bad", direction.sentence) for direction in fit.degenerate),
+            *own,
+            *_left_out(fit),
+        ]
+    )
+
+
+def _of_survey(
+    survey: Survey,
+    fit: Calibration,
+    warnings: Sequence[SurveyFinding],
+    undetected: Sequence[str],
+    jointly: Calibration | CalibError | None,
+) -> Iterator[Reason]:
+    """The reasons that only a survey has."""
+    yield from _wider(fit)
+    yield from _jointly(survey, jointly)
+    yield from _odd_images(fit)
+    yield from _turned(fit)
+    yield from _pointing_of_pairs(fit)
+    yield from _at_the_end(fit)
+    yield from (Reason("care", sentence) for sentence in exchanged_boards(survey, fit))
     if undetected:
-        reasons.append(Reason("care", f"no dots were found in {len(undetected)} images: {_some(undetected)}"))
-    joint = np.isfinite(calibration.chi2_probability)
+        yield Reason("care", f"no dots were found in {len(undetected)} images: {_some(undetected)}")
+    joint = np.isfinite(fit.chi2_probability)
     if count := sum(not (joint and warning.tested_again) for warning in warnings):
-        reasons.append(Reason("care", f"the check of the survey warned {count} times"))
-    grades = {reason.grade for reason in reasons}
-    grade: Grade = "bad" if "bad" in grades else "care" if "care" in grades else "good"
-    return CalibrationVerdict(grade, tuple(reasons))
+        yield Reason("care", f"the check of the survey warned {count} times")
 
 
-def _noise(survey: Survey, calibration: Calibration) -> list[Reason]:
-    """Whether the residuals are what the stated sigmas make them."""
-    if not np.isfinite(calibration.chi2_probability):
-        worst = max((max(xy), name) for name, xy in calibration.rms_px.items())
-        words = f"the largest residual of the fitted images is {worst[0]:.2f} px rms ({worst[1]})"
-        if worst[0] > PAPER_GOOD_PX:
-            upright = calibration.mast_parameters == 4
-            why = "the mast is not upright: use --mast 6" if upright else "station and boards do not agree"
-            return [Reason("bad", f"{words}: {why}")]
-        return [Reason("good", f"{words}, within what station errors of some mm leave")]
-    factor = np.sqrt(calibration.chi2 / max(calibration.degrees_of_freedom, 1.0))
-    words = (
-        f"chi-square is {calibration.chi2:.0f} for {calibration.degrees_of_freedom:.0f} degrees of freedom: "
-        f"the residuals are {factor:.2f} times what the stated sigmas make them"
-    )
-    wrong = [c for c in calibration.components if c.wrong]
-    reasons = [Reason(chi_square_grade(calibration, factor), words)]
-    reasons += sigma_reasons(survey, calibration)
-    told = [c for c in calibration.components if np.isfinite(c.factor)]
-    if told and not wrong:
-        most = max(told, key=lambda c: c.factor)
-        words = f"each kind of measurement scatters no more than stated, most of all {most.kind}: "
-        words += f"{most.factor:.2f} ± {most.factor_sigma:.2f} times their sigma"
-        reasons.append(Reason("good", words))
-    return reasons
-
-
-def chi_square_grade(calibration: Calibration | BenchCalibration, factor: float) -> Grade:
-    """Return how bad residuals are that are ``factor`` times what stated sigmas make them: no reason by
-    themselves where single kinds of measurements, or images, explain it; these have reasons of their own."""
-    if calibration.chi2_probability >= Level.STATED:
-        return "good"
-    if any(c.wrong for c in calibration.components) or any(i.scatter > 1.0 for i in calibration.images):
-        return "good"
-    return "bad" if factor > UNEXPLAINED else "care"
-
-
-def sigma_reasons(survey: Survey, calibration: Calibration | BenchCalibration) -> list[Reason]:
-    """Return a reason for each kind of measurement whose stated sigma is not what its residuals show.
-
-    Too small a sigma is a fault of the survey. Too large a one is none, once the fit takes what was found;
-    unless it is so far off that the measurements may be smoothed, or copies.
-    """
-    components, images = calibration.components, calibration.images
-    wrong = [c for c in components if c.wrong]
-    reasons = []
-    for c in (*wrong, *(c for c in components if c.generous)):
-        most = allowed(survey, images, c.kind)
-        grade: Grade = "good" if c.generous or 1.0 < c.factor <= most else "care"
-        if c.factor > HOPELESS * most:
-            grade = "bad"
-        elif c.factor < 1.0 / HOPELESS and not survey.boards:  # a bench's are counts, which nobody chose
-            grade = "care"
-        reasons.append(Reason(grade, wrong_sentence(survey, images, c, wrong)))
-    return [*reasons, *_uneven(survey, images), *_one_station(survey, components)]
-
-
-def _uneven(survey: Survey, images: Sequence[ImageResiduals]) -> list[Reason]:
-    """Images that are noisier than others of their camera: each counts with what it scatters."""
-    order_px = survey.sigma.corner_px if survey.boards else survey.sigma.dot_px
-    noisy = [image for image in images if image.scatter > 1.0]
-    if not noisy:
-        return []
-    worst = max(noisy, key=lambda image: image.scatter)
-    beyond = [i for i in noisy if i.scatter * float(np.median(i.sigma_px)) > order_px]
-    words = (
-        f"{len(noisy)} of {len(images)} images scatter more than others of their camera, {worst.name} most, "
-        f"by {worst.scatter:.1f} times; each counts with its own sigma"
-    )
-    if len(beyond) <= MANY_UNEVEN * len(images):
-        return [Reason("good", words)]
-    return [Reason("care", f"{words}. That is many: look for motion, focus or light")]
-
-
-def _one_station(survey: Survey, components: Sequence[Component]) -> list[Reason]:
-    """Whether prisms scatter as the tapes of the same station do: by tapes alone its sigma is found smaller
-    than stated, and a wrong prism hides under the stated one."""
-    by_kind = {c.kind: c for c in components if np.isfinite(c.factor)}
-    tapes, prisms = by_kind.get(TAPES), by_kind.get(PRISMS)
-    if tapes is None or prisms is None or not tapes.generous or prisms.factor < tapes.factor:
-        return []
-    if as_one(tapes, prisms):
-        return []
-    sigma_mm = 1e3 * survey.sigma.station_m
-    words = (
-        f"prisms scatter by {prisms.factor * sigma_mm:.1f} mm where the tapes of the same station do by "
-        f"{tapes.factor * sigma_mm:.1f} mm: one of them, or their drawing, is wrong; measure them again"
-    )
-    return [Reason("care", words)]
-
-
-def _wider(calibration: Calibration) -> list[Reason]:
-    """Whether the residuals ask for a wider model than the one that was fitted."""
-    if not calibration.wider:
-        return []
-    asked = [model for model in calibration.wider if model.significant]
-    if not asked:
-        first = min(calibration.wider, key=lambda model: model.chance)
-        words = (
-            f"no wider model out of {len(calibration.wider)} would gain more than chance makes likely; most "
+def _of_bench(survey: Survey, fit: BenchCalibration) -> Iterator[Reason]:
+    """The reasons that only a bench has."""
+    yield from (Reason("care", note) for note in fit.notes if " moved during placement " in note)
+    yield from _inexact(survey, fit)
+    if len(fit.rover_from_board) < 2:
+        yield Reason(
+            "care",
+            "all images show one placement: how far off things are hangs on one board at one distance; "
+            "put it up once more, at another distance and turned by some 30 degrees",
         )
-        words += f"does {first.name}, {first.gain:.1f} in chi-square with {first.numbers} numbers"
-        return [Reason("good", words)]
-    first, *others = asked
+    for drift in fit.drifts:
+        if drift.chance < Level.STATED:
+            yield Reason("bad" if drift.size_px > POINTING_GOOD_PX else "care", drift.sentence)
+    yield _pointing_of_workspace(fit)
+
+
+def _noise(survey: Survey, fit: Calibration | BenchCalibration) -> list[Reason]:
+    """Whether the residuals are what the stated sigmas make them."""
+    if isinstance(fit, BenchCalibration) or np.isfinite(fit.chi2_probability):
+        return [chi_square_reason(fit), *sigma_reasons(survey, fit), *_no_more_than_stated(fit)]
+    worst_px, camera = max((max(xy), name) for name, xy in fit.rms_px.items())
+    sentence = f"the largest residual of the fitted images is {worst_px:.2f} px rms ({camera})"
+    if worst_px > PAPER_GOOD_PX:
+        upright = fit.mast_parameters == 4
+        why = "the mast is not upright: use --mast 6" if upright else "station and boards do not agree"
+        return [Reason("bad", f"{sentence}: {why}")]
+    return [Reason("good", f"{sentence}, within what station errors of some mm leave")]
+
+
+def _no_more_than_stated(fit: FittedRig) -> list[Reason]:
+    known = [c for c in fit.components if np.isfinite(c.factor)]
+    if not known or any(c.wrong for c in fit.components):
+        return []
+    most = max(known, key=lambda c: c.factor)
+    sentence = (
+        f"each kind of measurement scatters no more than stated, most of all {most.kind}: "
+        f"{most.factor:.2f} ± {most.factor_sigma:.2f} times their sigma"
+    )
+    return [Reason("good", sentence)]
+
+
+def _wider(fit: Calibration) -> list[Reason]:
+    """Whether the residuals ask for a wider model than the one that was fitted."""
+    if not fit.wider:
+        return []
+    needed = [model for model in fit.wider if model.significant]
+    if not needed:
+        first = min(fit.wider, key=lambda model: model.chance)
+        sentence = (
+            f"no wider model out of {len(fit.wider)} would gain more than chance makes likely; most "
+            f"does {first.name}, {first.gain:.1f} in chi-square with {first.numbers} numbers"
+        )
+        return [Reason("good", sentence)]
+    first, *others = needed
     grade: Grade = "bad" if first.size_px > POINTING_GOOD_PX else "care"
     more = "one more number" if first.numbers == 1 else f"{first.numbers} more numbers"
-    words = f"{more} would gain {first.gain:.0f} in chi-square: {first.sentence}"
-    reasons = [Reason(grade, words)]
+    reasons = [Reason(grade, f"{more} would gain {first.gain:.0f} in chi-square: {first.sentence}")]
     if others:
         names = _some([f"{model.name} ({model.gain:.0f} with {model.numbers})" for model in others])
         reasons.append(Reason("care", f"other terms that would gain, perhaps by the same cause: {names}"))
     return reasons
 
 
-def contradiction_reasons(calibration: Calibration | BenchCalibration) -> list[Reason]:
-    """Return whether placements agree with one another."""
-    placements = calibration.contradictions
+def _contradictions(fit: FittedRig) -> list[Reason]:
+    """Whether placements agree with one another."""
+    placements = fit.contradictions
     odd = [one for one in placements if one.significant]
     if len(placements) == 2:  # either contradicts the other
         odd = odd[:1]
@@ -266,18 +186,18 @@ def _jointly(survey: Survey, fit: Calibration | CalibError | None) -> list[Reaso
     if fit is None:
         return []
     if isinstance(fit, CalibError):
-        words = "whether sigmas and model are right was not tested, since the survey cannot be fitted jointly"
-        return [Reason("care", f"{words}: {fit}")]
-    reasons = [*sigma_reasons(survey, fit), *_wider(fit), *contradiction_reasons(fit)]
+        untested = "whether sigmas and model are right was not tested"
+        return [Reason("care", f"{untested}, since the survey cannot be fitted jointly: {fit}")]
+    reasons = [*sigma_reasons(survey, fit), *_wider(fit), *_contradictions(fit)]
     return [replace(reason, sentence=f"fitted jointly, {reason.sentence}") for reason in reasons]
 
 
-def _odd_images(calibration: Calibration) -> list[Reason]:
+def _odd_images(fit: Calibration) -> list[Reason]:
     """Images that the paper's method kept, though they are far from the others (joint tests each of them)."""
-    if np.isfinite(calibration.chi2_probability) or calibration.mast_parameters == 4:
+    if np.isfinite(fit.chi2_probability) or fit.mast_parameters == 4:
         return []
     groups: dict[tuple[str, str], list[tuple[float, str]]] = {}
-    for image in calibration.images:
+    for image in fit.images:
         if image.purpose != "check" and image.used.any():
             rms_px = float(np.sqrt(np.mean(image.residuals_px[image.used] ** 2)))
             groups.setdefault((image.camera, image.purpose), []).append((rms_px, image.name))
@@ -287,16 +207,16 @@ def _odd_images(calibration: Calibration) -> list[Reason]:
         odd = [(rms_px, name) for rms_px, name in group if rms_px > ODD_IMAGE * usual]
         if len(group) >= FEW_IMAGES and odd:
             rms_px, name = max(odd)
-            words = f"image {name} is off by {rms_px:.2f} px rms where others like it are by {usual:.2f}"
-            reasons.append(Reason("care", f"{words}: check its tapes, its angles and its dots"))
+            off = f"image {name} is off by {rms_px:.2f} px rms where others like it are by {usual:.2f}"
+            reasons.append(Reason("care", f"{off}: check its tapes, its angles and its dots"))
     return reasons
 
 
-def _checks(calibration: Calibration) -> list[Reason]:
+def _checks(fit: Calibration | BenchCalibration) -> list[Reason]:
     """Whether images that were not fitted are predicted as well as they should be."""
     reasons = [
         Reason("bad", f"check image {image.name} cannot show placement {image.placement}, which it names")
-        for image in calibration.images
+        for image in fit.images
         if image.purpose == "check" and not np.isfinite(image.residuals_px).all()
     ]
     reasons += [
@@ -305,116 +225,117 @@ def _checks(calibration: Calibration) -> list[Reason]:
             f"image {click.image} cannot show check point {click.point}, which was clicked in it: correct "
             "its row in clicks.csv or the point's in station.csv",
         )
-        for click in calibration.unseen_clicks
+        for click in (fit.unseen_clicks if isinstance(fit, Calibration) else ())
     ]
-    if not (calibration.check_rms_px or reasons):
+    if not (fit.check_rms_px or reasons):
         return [Reason("care", "there is no check image: nothing shows how well the result predicts")]
-    for camera, size in calibration.checks.items():
-        words = (
-            f"check images of {camera} are off by {size.seen_px:.2f} px rms an axis where the survey's noise "
-            f"explains {size.expected_px:.2f}"
+    for camera, size in fit.checks.items():
+        sentence = (
+            f"check images of {camera} are off by {size.seen_px:.2f} px rms an axis where "
+            f"{size.expected_px:.2f} are expected; more than {size.most_px:.2f} would be bad"
         )
-        grade: Grade = "good" if size.seen_px <= size.most_px else "bad"
-        reasons.append(Reason(grade, f"{words}; more than {size.most_px:.2f} would be bad"))
+        reasons.append(Reason("good" if size.seen_px <= size.most_px else "bad", sentence))
     return reasons
 
 
-def _open(calibration: Calibration) -> list[Reason]:
-    return [Reason("bad", direction.sentence) for direction in calibration.degenerate]
-
-
-def _turned(calibration: Calibration) -> list[Reason]:
+def _turned(fit: Calibration) -> list[Reason]:
     """Whether the mast is turned about: a tilt that counts down fits as well, with the head half a turn off.
 
     `calib.survey.mixups` mostly refuses such a survey before.
     """
-    angle = float(np.linalg.norm(Rotation.from_euler("XYZ", calibration.rig.mast.rotation_rad).as_rotvec()))
+    angle = float(np.linalg.norm(Rotation.from_euler("XYZ", fit.rig.mast.rotation_rad).as_rotvec()))
     if angle < TURNED_RAD:
         return []
-    words = f"the mast comes out turned by {np.degrees(angle):.0f} degrees against the rover"
-    return [Reason("bad", f"{words}: pan or tilt has the wrong sign (right and up are positive)")]
+    turned = f"the mast comes out turned by {np.degrees(angle):.0f} degrees against the rover"
+    return [Reason("bad", f"{turned}: pan or tilt has the wrong sign (right and up are positive)")]
 
 
-def _pointing(calibration: Calibration) -> list[Reason]:
-    """How much the calibration alone adds to a pointing from a click."""
+def _inexact(survey: Survey, fit: BenchCalibration) -> Iterator[Reason]:
+    """Whether corners are where the board's measures and the lenses have them, but for noise."""
+    if fit.inexact_m > 0.0:
+        off_px = fit.inexact_m * float(
+            np.median([fit.rig.cameras[i.camera].model.focal_px[0] / i.range_m for i in fit.images])
+        )
+        yield Reason(
+            "care" if off_px > LITTLE * survey.sigma.corner_px else "good",
+            f"corners are off by some {1e3 * fit.inexact_m:.2g} mm on the board, each alike in all "
+            "images: an inexact print. They count with that, but since it is the same in every image, "
+            "uncertainties are rather too small",
+        )
+
+
+def _pointing_of_pairs(fit: Calibration) -> list[Reason]:
+    """How much the calibration alone adds to a pointing from a click, pair by pair."""
     reasons = []
-    for pair, names in calibration.rig.stereo.items():
-        if calibration.rig.cameras[names[0]].on != "head":
+    for pair, names in fit.rig.stereo.items():
+        if fit.rig.cameras[names[0]].on != "head":
             continue
-        sigma = pointing_sigma_px(calibration, names)
+        sigma = pointing_sigma_px(fit, names)
         if sigma is None:
             reasons.append(Reason("care", f"pointing by {pair} at {POINTING_RANGE_M:g} m is not possible"))
             continue
-        grade: Grade = "good" if sigma <= POINTING_GOOD_PX else "care" if sigma <= POINTING_BAD_PX else "bad"
-        words = f"pointing {pair} at what was clicked near a corner at {POINTING_RANGE_M:g} m"
-        reasons.append(
-            Reason(grade, f"{words} is uncertain by {sigma:.2f} px an axis from calibration alone")
-        )
+        near_corner = f"pointing {pair} at what was clicked near a corner at {POINTING_RANGE_M:g} m"
+        sentence = f"{near_corner} is uncertain by {sigma:.2f} px an axis from calibration alone"
+        reasons.append(Reason(_pointing_grade(sigma), sentence))
     return reasons
 
 
-def pointing_sigma_px(calibration: Calibration, pair: tuple[str, str]) -> float | None:
-    """Return the sigma (rms per axis, pixels) of pointing at targets clicked near the image's corners.
-
-    None if no such target can be pointed at.
-    """
-    width, height = calibration.rig.cameras[pair[0]].model.size_px
-    seen = [i for i in calibration.images if i.camera == pair[0] and i.pan_rad is not None]
-    pan = float(np.median([i.pan_rad for i in seen])) if seen else 0.0
-    tilt = float(np.median([i.tilt_rad for i in seen])) if seen else 0.0
-    variances = []
-    for x, y in ((0.2, 0.2), (0.8, 0.2), (0.2, 0.8), (0.8, 0.8)):
-        try:
-            left_px = np.array([x * width, y * height])
-            covariance = pointing_covariance(calibration, pair, pan, tilt, left_px, POINTING_RANGE_M)
-        except CalibError:
-            continue
-        variances.append(np.trace(covariance) / 2)
-    return float(np.sqrt(np.mean(variances))) if variances else None
+def _pointing_of_workspace(fit: BenchCalibration) -> Reason:
+    """How much the calibration adds to a pointing from a click, beside what a reading adds."""
+    expected = expected_pointing(fit)
+    if expected is None:
+        return Reason("care", "pointing at 2 to 10 m is not possible at the angles at which boards were seen")
+    landings, covariance = expected
+    by_rig, by_counts = landings.rms_px(covariance), landings.by_counts_px(fit.joint_rad)
+    sentence = f"a first pointing is uncertain by {by_rig:.2f} px an axis from calibration"
+    if by_counts > 0.0:
+        sentence += f", by {by_counts:.2f} from what a reading says"
+    return Reason(_pointing_grade(by_rig, by_counts), sentence)
 
 
-def _left_out(calibration: Calibration) -> list[Reason]:
+def _pointing_grade(by_rig_px: float, by_counts_px: float = 0.0) -> Grade:
+    if by_rig_px <= max(POINTING_GOOD_PX, by_counts_px):
+        return "good"
+    return "care" if by_rig_px <= max(POINTING_BAD_PX, by_counts_px) else "bad"
+
+
+def _left_out(fit: Calibration | BenchCalibration) -> list[Reason]:
     """Whether too much was rejected."""
-    by_kind = {
-        kind: [outlier for outlier in calibration.outliers if outlier.kind == kind]
-        for kind in ("dot", "image", "tape", "prism")
-    }
-    fitted = [image for image in calibration.images if image.purpose != "check"]
+    fitted = [image for image in fit.images if image.purpose != "check"]
     dots = sum(len(image.used) for image in fitted)
+    points = "dots" if isinstance(fit, Calibration) else "corners"
     reasons = []
-    for kind, count in (("dot", dots), ("image", len(fitted))):
-        left = len(by_kind[kind])
+    for kind, name, count in (("dot", points, dots), ("image", "images", len(fitted))):
+        left = sum(outlier.kind == kind for outlier in fit.outliers)
         if left > MANY_LEFT_OUT * max(count, 1):
-            reasons.append(Reason("care", f"{left} of {count} {kind}s were left out; look for the cause"))
-    tapes = sum(point.kind == "tape" for point in calibration.station)
-    if by_kind["prism"] or len(by_kind["tape"]) > MANY_LEFT_OUT * tapes:
-        names = _some([outlier.name for kind in ("prism", "tape") for outlier in by_kind[kind]])
-        reasons.append(Reason("care", f"measure again: {names}"))
-    if not reasons and calibration.outliers:
-        reasons.append(Reason("good", f"{len(calibration.outliers)} measurements were left out, each named"))
+            reasons.append(Reason("care", f"{left} of {count} {name} were left out; look for the cause"))
+    prisms, tapes = ([o.name for o in fit.outliers if o.kind == kind] for kind in ("prism", "tape"))
+    station = fit.station if isinstance(fit, Calibration) else ()
+    if prisms or len(tapes) > MANY_LEFT_OUT * sum(point.kind == "tape" for point in station):
+        reasons.append(Reason("care", f"measure again: {_some([*prisms, *tapes])}"))
+    if not reasons and fit.outliers:
+        reasons.append(Reason("good", f"{len(fit.outliers)} measurements were left out, each named"))
     return reasons
 
 
-def _at_the_end(calibration: Calibration) -> list[Reason]:
-    """Whether the last images of a camera were left out: what changed before them still holds, untold.
+def _at_the_end(fit: Calibration) -> list[Reason]:
+    """Whether the last images of a camera were left out: what changed before them still holds, unnoticed.
 
     Were they kept, the fit would test such a change; an image that was left out takes its evidence along.
     """
     fitted: dict[str, list[ImageResiduals]] = {}
-    for image in calibration.images:
+    for image in fit.images:
         if image.purpose != "check":
             fitted.setdefault(image.camera, []).append(image)
     reasons = []
     for camera, images in fitted.items():
         last = list(takewhile(lambda image: not image.used.any(), reversed(images)))
         if 0 < len(last) < len(images):
-            words = f"the last {len(last)} of {len(images)} images of {camera} were left out"
+            left_out = f"the last {len(last)} of {len(images)} images of {camera} were left out"
             if len(last) == 1:
-                words = f"the last of {len(images)} images of {camera} was left out"
-            since = (
-                f"{words}: if focus, mount or a joint changed before {last[-1].name}, the result is of before"
-            )
-            reasons.append(Reason("care", f"{since}; take some images again"))
+                left_out = f"the last of {len(images)} images of {camera} was left out"
+            since = f"if focus, mount or a joint changed before {last[-1].name}, the result is of before"
+            reasons.append(Reason("care", f"{left_out}: {since}; take some images again"))
     return reasons
 
 

@@ -176,11 +176,16 @@ def _report(args: argparse.Namespace, done: Calibrated, in_use: StoredRig | None
     if args.report is None:
         return None
     from calib.errors import BadFile
-    from mastctl.calibration.report import write_calibration_report
+    from mastctl.calibration.report import write_report
 
     with output.waiting(args.json, "writing the report"):
         try:
-            return write_calibration_report(done, in_use, args.report)
+            former = None if in_use is None else in_use.rig
+            undetected = [f"{name}: {reason}" for name, reason in done.undetected]
+            return write_report(
+                args.report, "calibration.html", done.survey, done.calibration, done.verdict, done.saved,
+                former, warnings=done.warnings, undetected=undetected,
+            )  # fmt: skip
         except (OSError, BadFile) as error:
             saved = f"the mast file {done.saved.path} is saved, but its report is not"
             raise output.CommandError("report_not_written", f"{saved}: {error}") from None
@@ -189,69 +194,44 @@ def _report(args: argparse.Namespace, done: Calibrated, in_use: StoredRig | None
 def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> dict[str, Any]:
     """The document that ``--json`` prints."""
     from calib.adjust.result import HELD_FIXED
-    from calib.files.yaml_text import plain
-    from mastctl.calibration.mast_file import as_lists, mast_keys
-    from mastctl.calibration.report import change_summary
-    from mastctl.calibration.tested import components_told, findings_as_json
+    from mastctl.as_json import as_json
+    from mastctl.calibration.landing import pointing_change
+    from mastctl.calibration.mast_file import findings_as_json, fit_document, picked
 
     fit = done.calibration
-    sigma = plain(fit.sigma)
-    document: dict[str, Any] = {
-        "rms_px": as_lists(fit.rms_px),
-        "check_rms_px": as_lists(fit.check_rms_px),
-        "mast": mast_keys(fit.rig),
-        # The mast's own keys stand at the top beside the file's two sections.
-        "sigma": {**sigma["mast"], **sigma},
-        "seconds": fit.seconds,
-        "method": fit.method,
-        "mast_parameters": fit.mast_parameters,
-        "mast_file": {
-            "path": str(done.saved.path),
-            "digest": done.saved.digest,
-            "previous": None if done.previous is None else str(done.previous),
-        },
+    document = fit_document(done.survey, fit, done.verdict, done.saved)
+    document["mast_file"]["previous"] = None if done.previous is None else str(done.previous)
+    document |= {
+        **picked(fit, "method", "mast_parameters"),
         "survey_digest": done.survey.digest,
-        "chi2": _finite(fit.chi2),
-        "degrees_of_freedom": _finite(fit.degrees_of_freedom),
-        "chi2_probability": _finite(fit.chi2_probability),
-        "sigmas_found": components_told(done.survey, fit),
         "wider_models": findings_as_json(fit.wider),
         "cross_validation": findings_as_json(fit.contradictions),
-        "outliers": [
-            {"kind": o.kind, "name": o.name, "sentence": o.sentence, "size": _finite(o.size)}
-            for o in fit.outliers
-        ],
-        "degenerate": [{"parameters": list(d.parameters), "sentence": d.sentence} for d in fit.degenerate],
+        "outliers": [picked(one, "kind", "name", "sentence", "size") for one in fit.outliers],
         "held_fixed": list(HELD_FIXED),
-        "warnings": list(done.warnings),
+        "warnings": as_json(done.warnings),
         "undetected": [{"image": name, "reason": reason} for name, reason in done.undetected],
-        "notes": list(fit.notes),
-        "verdict": done.verdict.told(),
         "report": None if page is None else str(page),
     }
     if in_use is not None:
         document["in_use"] = {
             "path": str(in_use.path),
             "digest": in_use.digest,
-            "pointing_change": change_summary(fit, in_use),
+            "pointing_change": pointing_change(fit.rig, in_use.rig),
         }
     return document
 
 
-def _finite(number: float) -> float | None:
-    return float(number) if math.isfinite(number) else None
-
-
 def _shown(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> Iterator[Shown]:
-    from mastctl.calibration.report import camera_table, change_summary, mast_table
-    from mastctl.calibration.tested import component_table, finding_table
+    from mastctl.calibration.landing import pointing_change
+    from mastctl.calibration.report import camera_table, mast_table
+    from mastctl.calibration.sigmas import finding_table, sigma_table
 
     fit = done.calibration
     yield Shown(
         f"Mast ({fit.method}, {fit.mast_parameters} parameters, {fit.seconds:.1f} s)", *mast_table(fit)
     )
     yield Shown("Cameras", *camera_table(fit), fit.notes)
-    if (components := component_table(done.survey, fit)) is not None:
+    if (components := sigma_table(done.survey, fit)) is not None:
         yield Shown("Measurements", *components)
     if (wider := finding_table("wider model", fit.wider, TESTS_SHOWN)) is not None:
         yield Shown("Wider models, the likeliest first", *wider)
@@ -265,7 +245,7 @@ def _shown(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> Ite
     if fit.degenerate:
         rows = [[", ".join(d.parameters[:4]), d.sentence] for d in fit.degenerate]
         yield Shown("Left open by the survey", ["parameters", "why"], rows)
-    if in_use is not None and (changes := change_summary(fit, in_use)):
+    if in_use is not None and (changes := pointing_change(fit.rig, in_use.rig)):
         rows = [[pair, *(f"{change[key]:.2f}" for key in change)] for pair, change in changes.items()]
         yield Shown(
             f"Pointing would change against {in_use.path.name}, px",
@@ -280,7 +260,7 @@ def _shown(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> Ite
 
 
 def _off(outlier: Any) -> str:
-    if _finite(outlier.size) is None:
+    if not math.isfinite(outlier.size):
         return "out of view"
     pixels = outlier.kind in ("dot", "image")
     return f"{outlier.size:.2f} px" if pixels else f"{1000 * outlier.size:.1f} mm"

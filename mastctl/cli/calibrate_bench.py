@@ -100,7 +100,7 @@ def _again(args: argparse.Namespace) -> Answer:
     from calib.calibrate.bench.problem import BenchOptions
     from calib.survey.reader import read_survey
     from mastctl.bench.folder import former_rig, kept_frame, kept_moved
-    from mastctl.bench.result import save_bench
+    from mastctl.bench.result import fit_again
 
     survey = read_survey(args.folder)
     if not survey.boards:
@@ -115,7 +115,7 @@ def _again(args: argparse.Namespace) -> Answer:
     options = BenchOptions(kind=args.model)
     with output.waiting(args.json, f"fitting {len(survey.images)} images"):
         former, moved = former_rig(args.folder), kept_moved(args.folder)
-        done = save_bench(survey, args.out, args.report, options, frame, former, moved)
+        done = fit_again(survey, args.out, args.report, options, frame, former, moved)
     if args.compare_models and args.model is not None:
         survey = survey.as_model(args.model)
     models, lines = families_of(args, survey)

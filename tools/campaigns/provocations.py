@@ -58,7 +58,7 @@ from drivers.interfaces import Image
 from hil_tests.support.sim_survey.plan import SurveyPlan, rover_from_head
 from mastctl.bench.simulated import BOARD
 from mastctl.calibration.run import SurveyRefused, checked_survey
-from mastctl.calibration.verdict import judge_calibration
+from mastctl.calibration.verdict import judge
 from mastctl.cli.main import main as mastctl
 from mastctl.cli.tasks import results_of
 from mastctl.client import Client, Snapshot
@@ -132,7 +132,7 @@ def judged(task: ProvokedTask) -> ProvokedOutcome:
         return ProvokedOutcome(
             task.kind, made.summary, "", float("nan"), "", reasons, _names_cause(made, reasons)
         )
-    verdict = judge_calibration(made.survey, fit, warnings)
+    verdict = judge(made.survey, fit, warnings)
     errors = errors_in_sigmas(made, fit)
     worst = max(errors, key=errors.__getitem__)
     reasons = tuple(r.sentence for r in verdict.reasons if r.grade != "good")

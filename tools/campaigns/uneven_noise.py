@@ -32,9 +32,8 @@ from hil_tests.support.sim_survey.bench import BenchPlan, simulate_bench
 from hil_tests.support.sim_survey.noise import with_noise, with_uneven_noise
 from hil_tests.support.sim_survey.plan import SurveyPlan
 from hil_tests.support.sim_survey.survey import simulate_survey
-from mastctl.calibration.bench_verdict import judge_bench
 from mastctl.calibration.run import SurveyRefused, checked_survey
-from mastctl.calibration.verdict import judge_calibration
+from mastctl.calibration.verdict import judge
 from mastctl.cli.tasks import results_of
 from tools.campaigns.coverage import pixel_errors, plan_of
 from tools.campaigns.provocations import PAIRS, RIG, errors_in_sigmas, rig_of_pairs
@@ -115,11 +114,11 @@ def _outcome(task: UnevenTask, survey: Survey, rig: Rig) -> UnevenOutcome:
         if task.of == "noisy-survey":
             warnings = checked_survey(survey)
             fit = fit_joint(survey, 6)
-            verdict = judge_calibration(survey, fit, warnings)
+            verdict = judge(survey, fit, warnings)
             worst = max(errors_in_sigmas(Provoked(survey, rig, ""), fit).values())
         else:
             fit = fit_bench(survey)
-            verdict = judge_bench(survey, fit)
+            verdict = judge(survey, fit)
             worst = max(rms(pixel_errors(rig, name, fit)) for name in rig.cameras)
     except (SurveyRefused, CalibError) as refused:
         return UnevenOutcome(task.what, task.size, "", count, 0, (str(refused),), float("nan"))

@@ -17,7 +17,7 @@ from calib.geometry.rig import Rig
 from calib.geometry.significance import Level
 from calib.survey.records import Sigma
 from hil_tests.calib.adjust.small_surveys import survey_of
-from mastctl.calibration.verdict import judge_calibration
+from mastctl.calibration.verdict import judge
 
 OFF = 3.5
 """How many of its own sigmas a found factor may be from the true one."""
@@ -89,9 +89,7 @@ def test_a_sigma_that_is_too_large_is_told_and_harms_nothing(navcams: Rig) -> No
     found = by_kind(fit)
     for kind in ("tapes", "dots of navcam_left", "dots of navcam_right"):
         assert found[kind].generous and found[kind].weighed == pytest.approx(1 / 3, rel=0.25)
-    told = [
-        r for r in judge_calibration(survey, fit).reasons if "times their stated sigma: 0.1 px" in r.sentence
-    ]
+    told = [r for r in judge(survey, fit).reasons if "times their stated sigma: 0.1 px" in r.sentence]
     assert len(told) == 2 and {r.grade for r in told} == {"good"}
 
 

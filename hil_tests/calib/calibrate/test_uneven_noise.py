@@ -20,7 +20,7 @@ from hil_tests.support.sim_survey.blunders import with_changed_focus, with_moved
 from hil_tests.support.sim_survey.noise import with_noise
 from hil_tests.support.sim_survey.plan import SurveyPlan
 from hil_tests.support.sim_survey.survey import simulate_survey
-from mastctl.calibration.verdict import judge_calibration
+from mastctl.calibration.verdict import judge
 
 FACTOR_WITHIN = 0.1
 
@@ -75,7 +75,7 @@ def test_a_camera_knocked_by_less_than_a_pixel_is_named() -> None:
         for name, seen in survey.dots.items()
     }
     survey = replace(survey, dots=dots)
-    verdict = judge_calibration(survey, fit_joint(survey))
+    verdict = judge(survey, fit_joint(survey))
     assert verdict.grade != "good"
     assert any("navcam_left is another camera" in r.sentence or "navcam_left was" in r.sentence
                for r in verdict.reasons)  # fmt: skip
@@ -86,7 +86,7 @@ def test_a_refusal_names_the_camera_that_was_refocused() -> None:
     first = [i.name for i in survey.images if i.camera == "navcam_right" and i.purpose != "check"][6]
     survey = with_changed_focus(survey, "navcam_right", first, 1.01)
     try:
-        said = [r.sentence for r in judge_calibration(survey, fit_joint(survey)).reasons if r.grade != "good"]
+        said = [r.sentence for r in judge(survey, fit_joint(survey)).reasons if r.grade != "good"]
     except SurveyNotFitted as refused:
         said = [str(refused)]
     assert any("on navcam_right is another camera (focal length" in sentence for sentence in said)

@@ -24,7 +24,7 @@ from hil_tests.support.sim_survey.bench import NAVCAMS, BenchCamera, BenchPlan, 
 from mastctl.bench import frame
 from mastctl.bench.folder import FORMER
 from mastctl.bench.frame import RoverFrame, fit_in_rover
-from mastctl.calibration.bench_verdict import judge_bench
+from mastctl.calibration.verdict import judge
 from mastctl.cli.main import main
 
 HAZCAM = BenchCamera(
@@ -135,7 +135,7 @@ def test_a_placement_that_moved_is_left_out_with_a_sentence(
         frame.fit_in_frame(survey, frame.RoverFrame(), None)
     done = frame.fit_in_frame(survey, frame.RoverFrame(), None, moved={"p1": 24.7})
     assert {placement for _, placement in done.rover_from_board} == {"p2", "p3"}
-    (reason,) = [r for r in judge_bench(survey, done).reasons if "placement p1" in r.sentence]
+    (reason,) = [r for r in judge(survey, done).reasons if "placement p1" in r.sentence]
     assert reason.grade == "care" and "shows the board 24.7 px aside" in reason.sentence
 
 

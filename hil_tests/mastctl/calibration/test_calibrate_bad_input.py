@@ -23,7 +23,7 @@ from hil_tests.support.sim_survey.blunders import (
 )
 from mastctl.calibration.detection import with_dots
 from mastctl.calibration.run import FITS, checked_survey
-from mastctl.calibration.verdict import judge_calibration
+from mastctl.calibration.verdict import judge
 from mastctl.cli.main import main
 
 Cells = dict[str, str]
@@ -156,7 +156,7 @@ class Judged(NamedTuple):
 def judged(survey: Survey) -> Judged:
     """What the command does with a survey before it writes anything; the fit must be as good as the noise."""
     fit = FITS["joint"](survey, 6)
-    verdict = judge_calibration(survey, fit, checked_survey(survey, "joint"))
+    verdict = judge(survey, fit, checked_survey(survey, "joint"))
     assert all(0.08 < value < 0.12 for pair in fit.rms_px.values() for value in pair), fit.rms_px
     reasons = " | ".join(reason.sentence for reason in verdict.reasons)
     return Judged(verdict.grade, reasons, [outlier.name for outlier in fit.outliers])

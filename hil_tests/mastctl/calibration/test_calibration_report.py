@@ -17,14 +17,15 @@ from calib.geometry.covariance import moved_rig
 from calib.survey.records import Click, Survey, SurveyFinding
 from hil_tests.mastctl.calibration.survey_world import navcam_rig, navcam_survey
 from mastctl.calibration.landing import (
-    CORNER,
-    change_map,
+    NEAR_CORNERS,
+    POINTING_RANGE_M,
     click,
     handoff_errors_px,
+    pointing_change,
     pointing_error_px,
-    uncertainty_map,
+    pointing_sigma_px,
 )
-from mastctl.calibration.verdict import judge_calibration
+from mastctl.calibration.verdict import judge
 
 DRAWS = 100
 TURN_RAD = np.array([0.0, 0.0, 0.01])
@@ -46,68 +47,61 @@ def test_a_rig_that_is_believed_rightly_points_exactly() -> None:
     assert max(np.abs(error).max() for error in errors.values()) < 1e-6
 
 
-def test_the_map_of_uncertainty_is_the_spread_of_drawn_rigs(fitted: tuple[Survey, Calibration]) -> None:
-    _, calibration = fitted
-    found = uncertainty_map(calibration, "navcam", 6.0)
-    row, column = 4, 9
-    pan, tilt = found.pan_rad[column], found.tilt_rad[row]
-    rig, pair = calibration.rig, calibration.rig.stereo["navcam"]
+def test_the_uncertainty_of_pointing_is_the_spread_of_drawn_rigs(fitted: tuple[Survey, Calibration]) -> None:
+    _, fit = fitted
+    rig, pair = fit.rig, fit.rig.stereo["navcam"]
+    seen = [i for i in fit.images if i.camera == pair[0] and i.pan_rad is not None]
+    pan = float(np.median([i.pan_rad for i in seen]))
+    tilt = float(np.median([i.tilt_rad for i in seen]))
     size = np.array(rig.cameras[pair[0]].model.size_px)
-    target, left, right = click(rig, pair, pan, tilt, size * CORNER, 6.0)
+    clicks = [click(rig, pair, pan, tilt, size * corner, POINTING_RANGE_M) for corner in NEAR_CORNERS]
     rng = np.random.default_rng(5)
-    steps = rng.multivariate_normal(
-        np.zeros(len(calibration.covariance)), calibration.covariance, DRAWS, method="eigh"
-    )
-    errors = [
-        pointing_error_px(
-            moved_rig(rig, calibration.parameter_names, step), rig, pair, pan, tilt, target, left, right
-        )
-        for step in steps
-    ]
+    steps = rng.multivariate_normal(np.zeros(len(fit.covariance)), fit.covariance, DRAWS, method="eigh")
+    drawn = [moved_rig(rig, fit.parameter_names, step) for step in steps]
+    errors = [pointing_error_px(one, rig, pair, pan, tilt, *clicked) for one in drawn for clicked in clicks]
     spread = float(np.sqrt(np.mean(np.square(errors))))
-    assert found.by_click[row, column] == pytest.approx(spread, rel=0.2), "the spread of 200 numbers: 5 %"
+    assert pointing_sigma_px(fit, pair) == pytest.approx(spread, rel=0.2), "the spread of 200 numbers: 5 %"
 
 
 def test_a_turned_mast_changes_pointing_at_positions_but_not_at_clicks() -> None:
     rig = navcam_rig()
     turned = replace(rig, mast=replace(rig.mast, rotation_rad=rig.mast.rotation_rad + TURN_RAD))
-    change = change_map(rig, turned, "navcam", 6.0)
-    assert change is not None
-    middle = change.by_position[len(change.tilt_rad) // 2]
-    # 10 mrad about the pan axis at a focal length of 1290 px; the axis' own place stays.
-    np.testing.assert_allclose(middle, 12.9, rtol=0.1)
-    assert np.nanmax(change.by_click) < 1e-3
-    assert change_map(rig, replace(rig, cameras={}, stereo={}), "navcam", 6.0) is None
+    change = pointing_change(rig, turned)["navcam"]
+    # 10 mrad about the pan axis at a focal length of 1290 px, by the cosine of the elevation.
+    assert change["position_most_px"] == pytest.approx(12.9, rel=0.05)
+    assert 8.0 < change["position_median_px"] < 12.9
+    assert change["most_px"] < 1e-3
+    assert pointing_change(rig, replace(rig, cameras={}, stereo={})) == {}
 
 
 def test_the_worst_reason_decides(fitted: tuple[Survey, Calibration]) -> None:
     survey, calibration = fitted
-    assert judge_calibration(survey, calibration).grade == "good"
-    assert judge_calibration(survey, calibration, undetected=["a"]).grade == "care"
+    assert judge(survey, calibration).grade == "good"
+    assert judge(survey, calibration, undetected=["a"]).grade == "care"
     warning = SurveyFinding(
         "warning", "set-up level, placement mast-1", "its tapes are off", "Measure them again"
     )
-    assert judge_calibration(survey, calibration, warnings=[warning]).grade == "care"
+    assert judge(survey, calibration, warnings=[warning]).grade == "care"
     tape = replace(warning, tested_again=True)  # as the fit did, and found nothing
-    assert judge_calibration(survey, calibration, warnings=[tape]).grade == "good"
+    assert judge(survey, calibration, warnings=[tape]).grade == "good"
     exact = replace(calibration, chi2_probability=float("nan"))  # the paper's method takes tapes as exact
-    assert judge_calibration(survey, exact, warnings=[tape]).grade == "care"
+    assert judge(survey, exact, warnings=[tape]).grade == "care"
     unseen = replace(calibration, check_rms_px={})
-    assert judge_calibration(survey, unseen).grade == "care"
+    assert judge(survey, unseen).grade == "care"
     lost = Click("image7", "brick", np.array([10.0, 20.0]))
-    blind = judge_calibration(survey, replace(calibration, unseen_clicks=(lost,)))
+    blind = judge(survey, replace(calibration, unseen_clicks=(lost,)))
     assert blind.grade == "bad"
     assert any("image7 cannot show check point brick" in reason.sentence for reason in blind.reasons)
     prism = Outlier("prism", "prism p3 of set-up level", 50.0, 20.0, 0.02)
-    care = judge_calibration(survey, replace(calibration, outliers=(prism,)))
+    care = judge(survey, replace(calibration, outliers=(prism,)))
     assert care.grade == "care"
     assert "prism p3" in care.reasons[-1].sentence
     left_open = Degenerate(("mast.translation_m.z",), "tilt hardly moved")
-    assert judge_calibration(survey, replace(calibration, degenerate=(left_open,))).grade == "bad"
+    assert judge(survey, replace(calibration, degenerate=(left_open,))).grade == "bad"
     noisy = replace(calibration, chi2=9.0 * calibration.degrees_of_freedom, chi2_probability=0.0)
-    assert judge_calibration(survey, noisy).grade == "bad"
+    assert judge(survey, noisy).grade == "bad"
     off = {name: size._replace(seen_px=3.0) for name, size in calibration.checks.items()}
-    bad = judge_calibration(survey, replace(calibration, checks=off))
+    bad = judge(survey, replace(calibration, checks=off))
     assert bad.grade == "bad"
     assert any(r.grade == "bad" and "check images of navcam_left" in r.sentence for r in bad.reasons)
 
@@ -121,7 +115,7 @@ def test_the_last_images_of_a_camera_left_out_cost_trust(
     for names, said in ((mine[-count:], True), (mine[:count], False)):
         lost = {*names, *(mine[:1] if first_too else [])}
         images = [replace(i, used=i.used & (i.name not in lost)) for i in fit.images]
-        verdict = judge_calibration(survey, replace(fit, images=tuple(images)))
+        verdict = judge(survey, replace(fit, images=tuple(images)))
         last = [r for r in verdict.reasons if "of navcam_right w" in r.sentence]
         assert [r.grade for r in last] == ["care"] * said
         assert all(f"changed before {names[0]}, the result is of before" in r.sentence for r in last)
@@ -136,7 +130,7 @@ def test_prisms_that_scatter_more_than_their_tapes_cost_trust(
     grades = []
     for factor in (1.31, 0.3):
         components = (tapes, replace(prisms, factor=factor))
-        reasons = judge_calibration(survey, replace(fit, components=components)).reasons
+        reasons = judge(survey, replace(fit, components=components)).reasons
         grades.append([r.grade for r in reasons if r.sentence.startswith("prisms scatter by")])
     assert grades == [["care"], []]
 
@@ -147,9 +141,9 @@ def test_what_the_papers_method_made_is_judged_by_the_joint_fits_tests(
     survey = fitted[0]
     told = replace(survey, sigma=replace(survey.sigma, station_m=survey.sigma.station_m / 4))
     by_paper = fit_paper(told)
-    verdict = judge_calibration(told, by_paper, jointly=fit_joint(told))
+    verdict = judge(told, by_paper, jointly=fit_joint(told))
     assert any(
         r.grade == "care" and r.sentence.startswith("fitted jointly, tapes scatter") for r in verdict.reasons
     )
-    lost = judge_calibration(survey, fit_paper(survey), jointly=SurveyNotFitted("no start was found"))
+    lost = judge(survey, fit_paper(survey), jointly=SurveyNotFitted("no start was found"))
     assert lost.grade == "care" and any("was not tested" in r.sentence for r in lost.reasons)
