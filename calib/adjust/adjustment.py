@@ -20,7 +20,7 @@ dense block that is summed into the normal equations at once; these (some 300 un
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.adjust.solver import Normal
-from calib.adjust.stacks import AnyStack, ImageStack, StationStack, image_stack, station_stack
+from calib.adjust.stacks import AnyStack, ImageStack, StationStack
 from calib.adjust.terms import (
     DRAWING,
     JOINTS,
@@ -300,10 +300,11 @@ class Adjustment:
         yield from self.known(state)
 
     @cached_property
-    def _stacks(self) -> tuple[AnyStack, ...]:
+    def _stacks(self) -> list[AnyStack]:
         """Everything that counts, but what is known beforehand."""
-        images = [t for t in self.images if t.keep.any()]
-        return *self._of_images(images), *self._of_station([p for p in self.station if p.keep])
+        return self._stacked(
+            [*(t for t in self.images if t.keep.any()), *(p for p in self.station if p.keep)]
+        )
 
     def _of_images(self, images: Sequence[ImageTerm]) -> list[ImageStack]:
         """Stacks of images with the same camera and kinds of unknowns."""
@@ -314,7 +315,7 @@ class Adjustment:
                 term.board[0] in self.bowed, term.board in self.fixed,
             )  # fmt: skip
             groups.setdefault(kind, []).append(term)
-        return [image_stack(mine, self.unknowns, self._image_keys) for mine in groups.values()]
+        return [ImageStack.of(mine, self.unknowns, self._image_keys) for mine in groups.values()]
 
     def _image_keys(self, image: ImageTerm) -> Iterator[Key]:
         """The unknowns that an image depends on: a camera's first, a bow's last, between them what moves the
@@ -334,10 +335,18 @@ class Adjustment:
         """Whether the readings of an image are unknowns: they are fitted, and not exact."""
         return self.joint_rad > 0 and image.attitude is not None and image.attitude >= 0
 
-    def _of_station(self, points: Sequence[StationTerm]) -> list[StationStack]:
-        """Stacks of the station's prisms, and of its tapes."""
-        groups = ([p for p in points if (p.board is None) is prism] for prism in (True, False))
-        return [station_stack(mine, self.unknowns, self._station_keys) for mine in groups if mine]
+    def _stacked(self, terms: Iterable[ImageTerm | StationTerm]) -> list[AnyStack]:
+        """Stacks of images, of the station's prisms, and of its tapes."""
+        images, prisms, tapes = list[ImageTerm](), list[StationTerm](), list[StationTerm]()
+        for term in terms:
+            if isinstance(term, ImageTerm):
+                images.append(term)
+            else:
+                (prisms if term.board is None else tapes).append(term)
+        groups = [
+            StationStack.of(mine, self.unknowns, self._station_keys) for mine in (prisms, tapes) if mine
+        ]
+        return [*self._of_images(images), *groups]
 
     def _station_keys(self, point: StationTerm) -> Iterator[Key]:
         """The unknowns that a point of the station depends on."""
@@ -361,46 +370,29 @@ class Adjustment:
         joints = state.as_joints
         return gimbal(state.mast, joints.pan.true_rad(pan, from_pan), joints.tilt.true_rad(tilt, from_tilt))
 
-    def image_residual(self, state: Estimate, image: ImageTerm) -> FloatArray:
-        """Predicted less measured pixels of the dots that count, in sigmas, (2n,)."""
-        return self.image_residuals(state, [image])[0]
-
-    def image_residuals(self, state: Estimate, images: Sequence[ImageTerm]) -> list[FloatArray]:
-        """The same of some images; all at once is far quicker than one by one."""
+    def residuals(self, state: Estimate, terms: Sequence[ImageTerm | StationTerm]) -> list[FloatArray]:
+        """Return of each term, in sigmas: predicted less measured pixels of the dots that count, (2n,), or
+        the measured less the expected place in the rover frame, (3,)."""
         found: dict[int, FloatArray] = {}
-        for stack in self._of_images(images):
+        for stack in self._stacked(terms):
             off = self._off(state, stack)
             found |= {id(t): off[part].ravel() for t, part in zip(stack.terms, stack.parts, strict=True)}
-        return [found[id(image)] for image in images]
+        return [found[id(term)] for term in terms]
 
-    def unseen(self, state: Estimate) -> set[str]:
-        """The images in which a dot that counts has no pixel, by name."""
-        off = self.image_residuals(state, self.images)
-        return {
-            t.name for t, residual in zip(self.images, off, strict=True) if not np.isfinite(residual).all()
-        }
-
-    def image_blocks(self, state: Estimate, images: Sequence[ImageTerm]) -> list[ResidualBlock]:
-        """The dots of some images that count, and their Jacobians."""
-        return self._in_order(state, self._of_images(images), images)
-
-    def station_residual(self, state: Estimate, point: StationTerm) -> FloatArray:
-        """Measured less expected place of a prism or tape, in the rover frame and in sigmas, (3,)."""
-        return np.asarray(self._off(state, self._of_station([point])[0])[0])
-
-    def station_blocks(self, state: Estimate, points: Sequence[StationTerm]) -> list[ResidualBlock]:
-        """Some points of the station."""
-        return self._in_order(state, self._of_station(points), points)
-
-    def _in_order(
-        self, state: Estimate, stacks: Sequence[AnyStack], terms: Sequence[ImageTerm | StationTerm]
-    ) -> list[ResidualBlock]:
-        """The blocks of some terms, one each."""
+    def blocks_of(self, state: Estimate, terms: Sequence[ImageTerm | StationTerm]) -> list[ResidualBlock]:
+        """Return the same with their Jacobians; all at once is far quicker than one by one."""
         found: dict[int, ResidualBlock] = {}
-        for stack in stacks:
+        for stack in self._stacked(terms):
             blocks = self._blocks(state, stack)
             found |= {id(t): block for t, block in zip(stack.terms, blocks, strict=True)}
         return [found[id(term)] for term in terms]
+
+    def unseen(self, state: Estimate) -> set[str]:
+        """The images in which a dot that counts has no pixel, by name."""
+        off = self.residuals(state, self.images)
+        return {
+            t.name for t, residual in zip(self.images, off, strict=True) if not np.isfinite(residual).all()
+        }
 
     def _blocks(self, state: Estimate, stack: AnyStack) -> Iterator[ResidualBlock]:
         """The terms of a stack, each by itself."""
@@ -483,7 +475,7 @@ class Adjustment:
         """Return how the residuals of images that count follow small motions of the head and the camera,
         whether these are unknowns or not."""
         found = []
-        for image, block in zip(images, self.image_blocks(state, images), strict=True):
+        for image, block in zip(images, self.blocks_of(state, images), strict=True):
             model = state.cameras[image.camera]
             weight = np.sqrt(bounded_weights(block.residual, 2, self.huber))
             block = replace(

@@ -561,7 +561,7 @@ def _moved_before_tapes(fit: ScoredFit) -> Iterator[Hypothesis]:
         mine = [p for p in fit.problem.station if p.board == board and p.keep]
         if len(mine) < 2 or board not in shown:
             continue
-        for point, block in zip(mine, fit.problem.station_blocks(fit.state, mine), strict=True):
+        for point, block in zip(mine, fit.problem.blocks_of(fit.state, mine), strict=True):
             rates = rigid_rates(eye, pose.points(point.in_board_m)[None], pose.translation_m)[0]
             name = f"placement {board[1]} (set-up {board[0]})"
             rows.append(Effect(name, board, block, -rates / point.sigma_m, np.zeros((0, 6))))
@@ -590,7 +590,7 @@ def _drawing(fit: ScoredFit) -> Iterator[Hypothesis]:
         Effect(
             p.point, p.setup, block, -apart[names.index(p.point)] / p.sigma_m, np.zeros((0, apart.shape[2]))
         )
-        for p, block in zip(mine, fit.problem.station_blocks(fit.state, mine), strict=True)
+        for p, block in zip(mine, fit.problem.blocks_of(fit.state, mine), strict=True)
     ]
 
     def sentence(found: Finding) -> str:

@@ -165,7 +165,7 @@ def name_outliers(
     for whole, term, judged in zip(all_images, problem.images, seen, strict=True):
         if term.keep.all():
             continue
-        residual = problem.image_residual(state, whole).reshape(-1, 2) * whole.sigma_px[:, None]
+        residual = problem.residuals(state, [whole])[0].reshape(-1, 2) * whole.sigma_px[:, None]
         if not term.keep.any():
             _, statistic, limit, _ = judged.whole(False, limits)
             size = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
@@ -179,7 +179,7 @@ def name_outliers(
         if point.keep:
             continue
         limit = limits.point(freedom or 3)
-        size = float(np.linalg.norm(problem.station_residual(state, point)) * point.sigma_m)
+        size = float(np.linalg.norm(problem.residuals(state, [point])[0]) * point.sigma_m)
         kind: Literal["prism", "tape"] = "prism" if point.board is None else "tape"
         found.append(Outlier(kind, point.name, statistic, limit, size))
     return tuple(found)
@@ -224,11 +224,11 @@ def _tested(
             tested(block, term.keep)[0],
             left_out(block, covariance[np.ix_(block.columns, block.columns)], term.keep, problem.huber),
         )
-        for block, term in zip(problem.image_blocks(state, all_images), problem.images, strict=True)
+        for block, term in zip(problem.blocks_of(state, all_images), problem.images, strict=True)
     ]
     points = [
         (float(statistic[0]), int(freedom[0]))
-        for block, term in zip(problem.station_blocks(state, problem.station), problem.station, strict=True)
+        for block, term in zip(problem.blocks_of(state, problem.station), problem.station, strict=True)
         for statistic, freedom in [tested(block, np.array([term.keep]))]
     ]
     whole = [s for (s, freedom), t in zip(points, problem.station, strict=True) if t.keep and freedom == 3]
@@ -264,8 +264,7 @@ def _culprit(problem: Adjustment, state: Estimate, suspect: int) -> int:
     if not 2 <= len(together) <= TELL_APART or board in problem.fixed:
         return suspect
     tapes = [p for p in problem.station if p.board == board and p.keep]
-    images = problem.image_blocks(state, [problem.images[i] for i in together])
-    blocks = images + problem.station_blocks(state, tapes)
+    blocks = problem.blocks_of(state, [*(problem.images[i] for i in together), *tapes])
     rates = [block.rates(("board", board)) for block in blocks]
     matrices = np.array([r.T @ r for r in rates])
     pulls = np.array([r.T @ block.residual for r, block in zip(rates, blocks, strict=True)])

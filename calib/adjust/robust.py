@@ -231,6 +231,6 @@ def typical_length(
     sigma counts as less than ``least_px``."""
     own_px = np.concatenate([t.sigma_px[t.keep] for t in images])
     own_sigma_px = np.maximum(own_px, least_px)
-    residuals = np.concatenate([r.reshape(-1, 2) for r in problem.image_residuals(state, images)])
+    residuals = np.concatenate([r.reshape(-1, 2) for r in problem.residuals(state, images)])
     lengths = np.linalg.norm(residuals, axis=1) * own_px / own_sigma_px
     return float(np.sqrt(typical_scale(lengths**2))), float(np.median(own_sigma_px))

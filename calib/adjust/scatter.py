@@ -157,7 +157,7 @@ def scattering(
     problem: Adjustment, state: Estimate, images: Sequence[ImageTerm]
 ) -> dict[str, tuple[ImageTerm, Scatter]]:
     """Return by image its term and its scatter, of those that show it."""
-    residuals = problem.image_residuals(state, [_whole(term) for term in images])
+    residuals = problem.residuals(state, [_whole(term) for term in images])
     measured = ((term, scatter(term, off)) for term, off in zip(images, residuals, strict=True))
     return {term.name: (term, one) for term, one in measured if one is not None}
 
@@ -175,7 +175,7 @@ def print_error_m(problem: Adjustment, state: Estimate) -> float:
     """
     sums: dict[tuple[str, int], tuple[FloatArray, FloatArray]] = {}
     shown = [t for t in problem.images if t.keep.any() and t.ids is not None and t.board not in problem.fixed]
-    for term, block in zip(shown, problem.image_blocks(state, shown), strict=True):
+    for term, block in zip(shown, problem.blocks_of(state, shown), strict=True):
         axes = state.rover_from_board[term.board].rotation[:, :2]
         by_place = block.rates(("board", term.board))[:, 3:].reshape(-1, 2, 3) @ axes
         off = block.residual.reshape(-1, 2)

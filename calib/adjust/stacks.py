@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
 
@@ -17,27 +18,28 @@ from calib.adjust.terms import ImageTerm, StationTerm
 from calib.adjust.unknowns import Key, Unknowns
 from calib.geometry.rigid import FloatArray
 
-Keys = tuple[Key, ...]
-
 
 @dataclass(frozen=True, eq=False)
 class _Stack:
-    """Terms in a row, of n points in all, and the unknowns of each: as many, in the same order.
+    """Terms in a row, of n points in all, and by term its unknowns and the indices (k,) of their numbers: as
+    many for each, in the same order."""
 
-    Attributes
-    ----------
-    keys, sizes
-        The unknowns of each term, and how many numbers each of these has.
-    columns
-        The indices (k,) of these numbers, by term.
-    counts
-        How many points each term has.
-    """
-
-    keys: tuple[Keys, ...]
-    sizes: tuple[int, ...]
+    terms: tuple[Any, ...]
+    keys: tuple[tuple[Key, ...], ...]
     columns: tuple[np.ndarray, ...]
-    counts: tuple[int, ...]
+    sizes: tuple[int, ...]
+
+    @classmethod
+    def of(cls, terms: Sequence[Any], unknowns: Unknowns, keys_of: Callable[[Any], Iterable[Key]]) -> Self:
+        """Return terms with unknowns of the same kinds in a row."""
+        keys = tuple(tuple(keys_of(term)) for term in terms)
+        columns = tuple(np.concatenate([unknowns.at(key) for key in mine]) for mine in keys)
+        return cls(tuple(terms), keys, columns, tuple(len(unknowns.at(key)) for key in keys[0]))
+
+    @property
+    def counts(self) -> Sequence[int]:
+        """How many points each term has."""
+        return [1] * len(self.terms)
 
     @cached_property
     def parts(self) -> tuple[slice, ...]:
@@ -49,60 +51,45 @@ class _Stack:
         return dict(zip(self.keys[at], _slices(self.sizes), strict=True))
 
 
-@dataclass(frozen=True, eq=False)
 class ImageStack(_Stack):
     """Images of one camera: the points (n, 3), pixels (n, 2), sigma (n,) and bend (n, 2) of those dots that
     count."""
 
     terms: tuple[ImageTerm, ...]
-    in_board_m: FloatArray
-    pixels_px: FloatArray
-    sigma_px: FloatArray
-    bend: FloatArray
+
+    @property
+    def counts(self) -> Sequence[int]:
+        return [int(t.keep.sum()) for t in self.terms]
+
+    @cached_property
+    def in_board_m(self) -> FloatArray:
+        return np.concatenate([t.in_board_m[t.keep] for t in self.terms])
+
+    @cached_property
+    def pixels_px(self) -> FloatArray:
+        return np.concatenate([t.pixels_px[t.keep] for t in self.terms])
+
+    @cached_property
+    def sigma_px(self) -> FloatArray:
+        return np.concatenate([t.sigma_px[t.keep] for t in self.terms])
+
+    @cached_property
+    def bend(self) -> FloatArray:
+        bends = [t.bend if len(t.bend) else np.zeros((len(t.keep), 2)) for t in self.terms]
+        return np.concatenate([bend[t.keep] for bend, t in zip(bends, self.terms, strict=True)])
 
 
-@dataclass(frozen=True, eq=False)
 class StationStack(_Stack):
     """Prisms, or tapes, and their sigma (n,)."""
 
     terms: tuple[StationTerm, ...]
-    sigma_m: FloatArray
+
+    @cached_property
+    def sigma_m(self) -> FloatArray:
+        return np.array([p.sigma_m for p in self.terms])
 
 
 AnyStack = ImageStack | StationStack
-
-
-def image_stack(
-    images: Sequence[ImageTerm], unknowns: Unknowns, keys_of: Callable[[ImageTerm], Iterable[Key]]
-) -> ImageStack:
-    """Return images of one camera in a row."""
-    bends = [t.bend if len(t.bend) else np.zeros((len(t.keep), 2)) for t in images]
-    return ImageStack(
-        *_unknowns(unknowns, [tuple(keys_of(t)) for t in images]),
-        tuple(int(t.keep.sum()) for t in images),
-        tuple(images),
-        np.concatenate([t.in_board_m[t.keep] for t in images]),
-        np.concatenate([t.pixels_px[t.keep] for t in images]),
-        np.concatenate([t.sigma_px[t.keep] for t in images]),
-        np.concatenate([bend[t.keep] for t, bend in zip(images, bends, strict=True)]),
-    )
-
-
-def station_stack(
-    points: Sequence[StationTerm], unknowns: Unknowns, keys_of: Callable[[StationTerm], Iterable[Key]]
-) -> StationStack:
-    """Return points of the station in a row."""
-    keys = [tuple(keys_of(p)) for p in points]
-    sigma_m = np.array([p.sigma_m for p in points])
-    return StationStack(*_unknowns(unknowns, keys), (1,) * len(points), tuple(points), sigma_m)
-
-
-def _unknowns(
-    unknowns: Unknowns, keys: Sequence[Keys]
-) -> tuple[tuple[Keys, ...], tuple[int, ...], tuple[np.ndarray, ...]]:
-    """The first three of a stack."""
-    sizes = tuple(len(unknowns.at(key)) for key in keys[0])
-    return tuple(keys), sizes, tuple(np.concatenate([unknowns.at(key) for key in mine]) for mine in keys)
 
 
 def _slices(sizes: Sequence[int]) -> tuple[slice, ...]:

@@ -47,7 +47,7 @@ def image_residuals(
     by_name = {i.name: i for i in survey.images}
     terms = [replace(t, keep=np.ones_like(t.keep)) for t in (*all_images, *checks)]
     found = []
-    for term, off in zip(terms, problem.image_residuals(state, terms), strict=True):
+    for term, off in zip(terms, problem.residuals(state, terms), strict=True):
         image = by_name[term.name]
         keep = used.get(term.name)
         residual = off.reshape(-1, 2) * term.sigma_px[:, None]
@@ -183,10 +183,10 @@ def station_residuals(problem: Adjustment, state: Estimate) -> tuple[StationResi
             p.setup,
             "" if p.board is None else p.board[1],
             p.point,
-            problem.station_residual(state, p) * p.sigma_m,
+            off * p.sigma_m,
             p.keep,
         )
-        for p in problem.station
+        for p, off in zip(problem.station, problem.residuals(state, problem.station), strict=True)
     )
 
 

@@ -191,7 +191,7 @@ def _prism_notes(problem: Adjustment, state: Estimate, mast_parameters: int) -> 
     notes = []
     for setup in state.rover_from_station:
         prisms = [p for p in problem.station if p.setup == setup and p.board is None and p.keep]
-        residuals = np.array([problem.station_residual(state, p) for p in prisms])
+        residuals = np.array(problem.residuals(state, prisms))
         if float(np.sum(residuals**2)) > chance_limit(Level.STATED, 1, 3 * len(prisms)):
             worst = 1000 * float(np.linalg.norm(residuals, axis=1).max()) * prisms[0].sigma_m
             why = "an upright mast" if mast_parameters == 4 else "their CAD positions"

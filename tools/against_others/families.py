@@ -171,7 +171,7 @@ def boards_problem(views: BoardViews, focal_px: float) -> tuple[Adjustment, Esti
 
 def boards_residuals(problem: Adjustment, state: Estimate) -> np.ndarray:
     """Return residuals of all corners, (n, 2), pixels."""
-    found = [problem.image_residual(state, term).reshape(-1, 2) for term in problem.images]
+    found = [off.reshape(-1, 2) for off in problem.residuals(state, problem.images)]
     return np.concatenate(found) * NOISE_PX
 
 

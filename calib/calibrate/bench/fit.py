@@ -153,7 +153,7 @@ def _refuse_slip(bench: BenchProblem, state: Estimate) -> None:
 def _without_lone_strays(problem: Adjustment, state: Estimate) -> Adjustment:
     """Leave out corners far off in images of which most corners are less so."""
     terms = []
-    for t, residual in zip(problem.images, problem.image_residuals(state, problem.images), strict=True):
+    for t, residual in zip(problem.images, problem.residuals(state, problem.images), strict=True):
         if not t.keep.any():
             terms.append(t)
             continue

@@ -102,7 +102,7 @@ def best_agreeing(
 
 def distances_px(problem: Adjustment, state: Estimate, images: Sequence[ImageTerm]) -> list[FloatArray]:
     """Return how far the points of each image that count are from where they should be (n,), pixels."""
-    residuals = problem.image_residuals(state, images)
+    residuals = problem.residuals(state, images)
     return [
         np.linalg.norm(off.reshape(-1, 2), axis=1) * t.sigma_px[t.keep]
         for t, off in zip(images, residuals, strict=True)

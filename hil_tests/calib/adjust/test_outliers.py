@@ -248,6 +248,5 @@ def problem_of(terms: list[ImageTerm], blocks: list[ResidualBlock]) -> Any:
         images=terms,
         station=[],
         huber=None,
-        image_blocks=lambda state, images: blocks,
-        station_blocks=lambda state, points: [],
+        blocks_of=lambda state, terms: blocks if terms else [],
     )
