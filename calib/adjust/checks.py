@@ -30,16 +30,9 @@ def expected_checks(
 ) -> dict[str, CheckExpected]:
     """Return by camera what its check images are off by, and should be.
 
-    Parameters
-    ----------
-    problem, state, covariance
-        A fit, and the covariance (p, p) of its unknowns.
-    checks
-        Check images, with sigmas as large as their dots scatter.
-    residuals
-        Of all images; dots that have no pixel do not count.
-    level
-        The chance with which the largest allowed size is passed.
+    ``covariance`` (p, p) is of a fit's unknowns, ``checks`` have sigmas as large as their dots scatter,
+    ``residuals`` are of all images; dots that have no pixel do not count. The largest allowed size is passed
+    with the chance ``level``.
     """
     off_px = {image.name: image.residuals_px for image in residuals}
     terms = [replace(t, keep=np.asarray(np.isfinite(off_px[t.name]).all(axis=1))) for t in checks]

@@ -38,18 +38,10 @@ STAYS = 20.0
 class Component:
     """How large the errors of one kind of measurement are.
 
-    Attributes
-    ----------
-    kind
-        ``dots of CAMERA``, ``tapes``, ``prisms``, ``joint readings`` or ``drawing`` (of the prisms).
-    count, redundancy
-        How many numbers were measured, and how many of them check the others.
-    factor, factor_sigma
-        Sigma found over sigma stated, and how sure that is.
-    weighed
-        The factor on the stated sigma for the fit: 1 where it is no more than luck.
-    chance, small_chance
-        Of residuals as large, and as small, were the stated sigma right.
+    ``kind`` is ``dots of CAMERA``, ``tapes``, ``prisms``, ``joint readings`` or ``drawing`` (of the prisms),
+    ``redundancy`` how many of the ``count`` numbers check the others, ``factor`` sigma found over sigma
+    stated, ``weighed`` the factor on the stated sigma for the fit: 1 where it is no more than luck. The
+    chances are of residuals as large, and as small, were the stated sigma right.
     """
 
     kind: str
@@ -79,14 +71,9 @@ def variance_components(
 ) -> tuple[Component, ...]:
     """Return the variance components of a fit at its minimum.
 
-    Parameters
-    ----------
-    blocks
-        Residuals in sigmas, and their Jacobians, of all that was measured.
-    covariance
-        (p, p) of the unknowns, the inverse of all the blocks' normal equations.
-    weighed
-        By what the stated sigma of a kind was multiplied before: residuals are in sigmas of that size.
+    ``blocks`` are of all that was measured, ``covariance`` (p, p) is of the unknowns, the inverse of all the
+    blocks' normal equations. ``weighed`` is by what the stated sigma of a kind was multiplied before:
+    residuals are in sigmas of that size.
     """
     before = weighed or {}
     size = len(covariance)

@@ -71,14 +71,8 @@ class LeftOut:
 def left_out(block: ResidualBlock, covariance: FloatArray, keep: np.ndarray, huber: float | None) -> LeftOut:
     """Return an image as the others predict it.
 
-    Parameters
-    ----------
-    block
-        All its dots at the minimum.
-    covariance
-        (k, k) of the unknowns that it touches.
-    keep, huber
-        Which dots (n,) were fitted, and from what length in sigmas on with bounded pulls.
+    ``block`` are all its dots at the minimum, ``covariance`` (k, k) is of the unknowns that it touches,
+    ``keep`` (n,) says which dots were fitted, from a length of ``huber`` sigmas on with bounded pulls.
     """
     scale = np.sqrt(np.diag(covariance))
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
@@ -99,14 +93,8 @@ def statistics(
     """Return chi-square of each measurement by itself (n,), infinite where a dot has no pixel, and how many
     numbers of it the others check (n,).
 
-    Parameters
-    ----------
-    residual, jacobian
-        (wn,) and (wn, k), in sigmas, of measurements of w numbers each.
-    covariance
-        (k, k) of the unknowns.
-    fitted
-        Which of the measurements (n,) were.
+    ``residual`` (wn,) and ``jacobian`` (wn, k), in sigmas, are of measurements of w numbers each, of which
+    some were ``fitted`` (n,); ``covariance`` (k, k) is of the unknowns.
     """
     rates = jacobian.reshape(len(fitted), -1, jacobian.shape[1])
     spread = np.einsum("nik,nkj->nij", rates @ covariance, rates.transpose(0, 2, 1))

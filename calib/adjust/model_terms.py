@@ -99,21 +99,11 @@ def entering_together(terms: Iterable[ModelTerm]) -> list[tuple[str, ...]]:
 class TermGain:
     """A part of the model that enters if the pictures ask for it, or cannot exclude one that would matter.
 
-    Attributes
-    ----------
-    term
-        What it is; its name is ``pan harmonic 1``, ``tilt backlash``, ``axis offset``, ``bow of b1``.
-    values, sigma
-        What the fit beside the other terms says its parameters are (k,), in the units of their names.
-    chi2, chance
-        By how much the weighted sum of squares is lower with it, and the chance of that were it nothing: of a
-        first harmonic before the second one, of a second one beyond the first.
-    hidden_px
-        What its sigma moves pixels by, rms.
-    moves_px
-        Rms over all corners of what it moves pixels by.
-    entered
-        Whether it is part of the model.
+    ``values`` and ``sigma`` (k,) are of its parameters beside the other terms, in the units of their names;
+    ``chi2`` is by how much the weighted sum of squares is lower with it, ``chance`` that of so much were it
+    nothing: of a first harmonic before the second one, of a second one beyond the first. Its sigma moves
+    pixels by ``hidden_px``, the term itself by ``moves_px``, rms over all corners. If it ``entered``, it is
+    part of the model.
     """
 
     term: ModelTerm
@@ -150,7 +140,7 @@ class TermGain:
 
     @property
     def sentence(self) -> str:
-        """The term in words."""
+        """The term for a person."""
         size = float(np.linalg.norm(self.values))
         spread = float(np.sqrt(np.mean(self.sigma**2)))
         unit = "mm" if self.term.kind in ("offset", "bow") else "mrad"

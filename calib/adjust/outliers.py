@@ -7,7 +7,7 @@ any image.
 
 A whole image is judged by all its dots at once, against what the other measurements predict of it: the error
 of that prediction moves the dots together, and counts once. The statistic is what the sum of squares falls by
-if the image is left out, whether it was fitted or not, so that every image is asked again whenever the fit
+if the image is left out, whether it was fitted or not, so that every image is tested again whenever the fit
 has changed. The station's stated sigma may be too small: its typical point then says by how much, and limits
 widen with it. Blunders hide one another, so the worst goes first and the fit is done
 again.
@@ -44,13 +44,11 @@ class Outlier:
 
     Attributes
     ----------
-    kind
-        What it is.
     name
-        Which one: ``image navcam_left-012``, ``image navcam_left-012 dot (row 3, column 4)``,
-        ``tape b of placement far-2 (set-up level)``, ``prism p3 of set-up level``.
+        ``image navcam_left-012``, ``image navcam_left-012 dot (row 3, column 4)``,
+        ``tape b of placement far-2 (set-up level)`` or ``prism p3 of set-up level``.
     statistic, limit
-        Sum of squares of its standardised residuals, and what it was allowed to be: at the stated rate of
+        Sum of squares of its standardised residuals, and the most that it may be: at the stated rate of
         false alarms, wider where the typical measurement is farther off than its sigma says. Not-a-number
         for an image that was left out with its board's tapes.
     size
@@ -66,7 +64,7 @@ class Outlier:
 
     @property
     def sentence(self) -> str:
-        """The outlier in words."""
+        """The outlier for a person."""
         if not np.isfinite(self.size):
             return f"{self.name} cannot show the board that it names and was not used"
         off = f"{self.size:.2f} px" if self.kind in ("dot", "image") else f"{1000 * self.size:.1f} mm"
@@ -108,12 +106,8 @@ def judge(
 ) -> tuple[list[ImageTerm], list[StationTerm]]:
     """Return the terms at a fitted state with the worst left out and what passes readmitted.
 
-    Parameters
-    ----------
-    problem, state, covariance
-        The fit; its terms' ``keep`` say what was left out so far.
-    all_images
-        The images with every dot that was measured, in the order of the problem's.
+    What the fit's terms keep was not left out so far. ``all_images`` are the problem's in its order, with
+    every dot that was measured.
     """
     seen, points, limits = _tested(problem, state, covariance, all_images)
     images, worst, worst_excess = [], None, 0.0

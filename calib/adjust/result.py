@@ -18,7 +18,7 @@ from calib.geometry.rigid import FloatArray, Rigid
 from calib.survey.records import Click, Survey
 
 HELD_FIXED = (
-    "R0 of every camera is held at 0: whatever it does, A, H and V do as well",
+    "R0 of every camera is fixed at 0: whatever it does, A, H and V do as well",
     "an offset of pan is no parameter: it is the mast's rotation z",
     "an offset of tilt is no parameter: it turns all head cameras together, which their own axes do as well",
 )
@@ -66,7 +66,7 @@ class StationResidual:
 
 @dataclass(frozen=True, eq=False)
 class Degenerate:
-    """A direction in which the survey says nothing: the unknowns that move together, and why, in words."""
+    """A direction in which the survey says nothing: the unknowns that move together, and why."""
 
     parameters: tuple[str, ...]
     sentence: str
@@ -88,8 +88,6 @@ class FittedRig:
 
     Attributes
     ----------
-    rig
-        Mast, joints and cameras; ``rig.fit`` and ``rig.provenance`` are empty.
     parameter_names, covariance
         (p,) and (p, p) of what was fitted of the mast, the joints and the cameras, as
         ``mast.translation_m.x`` and ``cameras.navcam_left.H.x`` (``calib.geometry.covariance``); what was
@@ -100,12 +98,8 @@ class FittedRig:
     rms_px, check_rms_px
         Camera to (x, y) rms of what was fitted in images, and of check images, which were not; pixels.
         Without images whose board, as it is named, the camera cannot see.
-    images
-        The residuals of every image.
-    outliers, degenerate
-        The measurements left out, each with its reason, and the directions left open.
-    notes
-        Further facts for a person, a sentence each.
+    outliers, degenerate, notes
+        The measurements left out, the directions left open, and further facts for a person, a sentence each.
     chi2, degrees_of_freedom, chi2_probability
         Sum of squares of the residuals in stated sigmas, what it is expected to be, and the chance of a
         larger one were all sigmas right; nan where the method does not weigh by them.
@@ -119,8 +113,6 @@ class FittedRig:
     contradictions
         Each placement tested against the others, the least likely first; empty where the method does not
         weigh by sigmas.
-    seconds
-        How long it took.
     """
 
     rig: Rig
@@ -157,16 +149,10 @@ class Calibration(FittedRig):
 
     Attributes
     ----------
-    method, mast_parameters
-        How it was fitted; 4, 6 or 8.
     estimate
         (p,) values of the parameters; 0 for the two of an A or O, which count from the rig's own.
     wider
         The gain of further numbers, the likeliest first; empty where the method does not weigh by sigmas.
-    station
-        The residuals of every prism and tape.
-    rover_from_station
-        By set-up.
     prisms_in_rover_m
         Refined where the CAD has a sigma.
     unseen_clicks
@@ -189,8 +175,6 @@ class BenchCalibration(FittedRig):
 
     Attributes
     ----------
-    terms
-        Every term that could have entered.
     gauges
         Quantities that pictures cannot determine, and how they were fixed, a sentence each.
     drifts

@@ -107,14 +107,8 @@ def weighed_fields(
 ) -> dict[str, Any]:
     """Return the fields of a `FittedRig` that follow from a weighed fit.
 
-    Parameters
-    ----------
-    stated
-        The fit by the stated sigmas, whose chi-square counts.
-    images, checks
-        All images with every dot, and the check images, with stated sigmas.
-    kinds, level, notes, widened
-        As of `calib.adjust.uncertainty.fitted_fields`.
+    Chi-square is that of the fit by the ``stated`` sigmas. ``images`` are all with every dot, and ``checks``
+    the check images, with stated sigmas; the rest is as of `calib.adjust.uncertainty.fitted_fields`.
     """
     problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
     order_px = survey.sigma.corner_px if survey.boards else survey.sigma.dot_px
@@ -165,14 +159,8 @@ def without_blunders(
 ) -> Cleaned:
     """Fit with pulls bounded, find each image's sigma, judge, and fit again until nothing fails.
 
-    Parameters
-    ----------
-    problem, all_images
-        With stated sigmas; all images with every dot.
-    start
-        A state that blunders may have moved.
-    order_px
-        What the survey states of all dots, one sigma (`calib.adjust.scatter.scales`).
+    ``problem`` has stated sigmas, ``all_images`` are its images with every dot, ``start`` is a state that
+    blunders may have moved, ``order_px`` as of `calib.adjust.scatter.scales`.
     """
     fit = minimise(problem, start, weak=problem.weak, gain=1e-7)
     _refuse_lost(fit)

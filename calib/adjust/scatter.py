@@ -3,7 +3,7 @@
 Over one board, what a fit leaves of an image's dots is a smooth function of the place on the board if
 anything moved the image as a whole, whatever it was: a polynomial takes it up. What is left is the dots' own
 noise, its sum of squares chi-square times the square of their sigma. So every image says for itself how
-noisy it is, before anybody asks whether it agrees with the others; and a whole image that is tested with
+noisy it is, before it is tested against the others; and a whole image that is tested with
 that sigma is tested for coherent shifts alone.
 
 Images of a camera that agree with each other have one scale, their camera's; luck changes none. Nothing is
@@ -79,12 +79,8 @@ def scatter(image: ImageTerm, residual: FloatArray, judged: np.ndarray | None = 
 def scales(found: Mapping[str, tuple[ImageTerm, Scatter]], order_px: float) -> Scales:
     """Return the scales of cameras and images.
 
-    Parameters
-    ----------
-    found
-        By image its term, with stated sigmas, and how much it scatters in these.
-    order_px
-        What the survey states of all its dots, one sigma.
+    ``found`` is by image its term, with stated sigmas, and how much it scatters in these; ``order_px`` what
+    the survey states of all its dots, one sigma.
     """
     cameras: dict[str, float] = {}
     images: dict[str, float] = {}
@@ -113,16 +109,9 @@ def own_scales(
     cameras: Mapping[str, float],
     order_px: float,
 ) -> dict[str, float]:
-    """Return by image what its sigmas count times beside its camera's: of images that were not fitted.
+    """Return by image what its stated sigmas count times beside its camera's: of images that were not fitted.
 
-    Parameters
-    ----------
-    problem, state
-        A fit; the images are with stated sigmas.
-    cameras
-        By kind of measurement what stated sigmas count times.
-    order_px
-        As of `scales`.
+    ``cameras`` is by kind of measurement what stated sigmas count times, ``order_px`` as of `scales`.
     """
     found = scattering(problem, state, images)
     return {
@@ -136,16 +125,8 @@ def with_scales(
 ) -> tuple[Adjustment, tuple[ImageTerm, ...], Scales]:
     """Return a problem and all its images, with every dot, by sigmas as large as their scatter shows.
 
-    Parameters
-    ----------
-    problem
-        Its images' sigmas do not count, but what of them is kept.
-    images
-        All, in the same order, with every dot and stated sigmas.
-    state
-        A first fit: what is left of an image may be large, but has to be smooth.
-    order_px
-        As of `scales`.
+    ``images`` are the problem's in its order, with every dot and stated sigmas, ``state`` is a first fit:
+    what is left of an image may be large, but has to be smooth. ``order_px`` is as of `scales`.
     """
     found = scales(scattering(problem, state, images), order_px)
     every = widened_images(scattered_images(images, found.images), found.cameras)
@@ -194,21 +175,11 @@ def print_error_m(problem: Adjustment, state: Estimate) -> float:
 def off_smooth(
     places: FloatArray, values: FloatArray, sigma: FloatArray, degree: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return how far points are from a polynomial of the others.
+    """Return how far points are from a polynomial of the others: chi-square of two degrees of freedom (n,),
+    and the distance (n,).
 
-    Parameters
-    ----------
-    places, values
-        (n, 2) where each point is, of the order of one, and what is smooth over these.
-    sigma
-        (n,) of a value's coordinate.
-    degree
-        Of the polynomial.
-
-    Returns
-    -------
-    FloatArray, FloatArray
-        (n,) each point's chi-square, of two degrees of freedom, and its distance.
+    ``places`` (n, 2), of the order of one, are where each point is, ``values`` (n, 2) what is smooth over
+    these, ``sigma`` (n,) that of a value's coordinate.
     """
     x, y = places.T
     terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)

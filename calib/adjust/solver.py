@@ -71,17 +71,9 @@ def minimise(
 ) -> Minimum[State]:
     """Minimise a problem's cost from a start.
 
-    Parameters
-    ----------
-    problem, start
-        The problem, and its start.
-    weak
-        (p,) added to the diagonal of JᵀJ without any pull: unknowns that the data leave open stay where
-        they are. None adds nothing.
-    steps
-        Most steps to take.
-    gain
-        It has settled when a step is expected to lower the cost by less than this part of it.
+    ``weak`` (p,) is added to the diagonal of JᵀJ without any pull: unknowns that the data leave open stay
+    where they are. A fit takes ``steps`` at most, and has settled when a step is expected to lower the cost
+    by less than the part ``gain`` of it.
     """
     state, normal = start, problem.normal(start)
     damping = FIRST_DAMPING

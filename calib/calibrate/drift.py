@@ -30,7 +30,7 @@ from calib.matching.verdict import MatchSettings
 from calib.matching.warp import Grey, PosedImage, facing_plane
 
 ALARM_SIGMAS = 6.0
-"""A change is reported from here on, if two looks one after the other say so."""
+"""A change is reported from here on, if two checks one after the other find it."""
 
 JOINT_SIGMA_RAD = 2e-4
 """What a rest of the head is off by chance, each time."""
@@ -43,12 +43,12 @@ LEAST_PART, MOST_SPREAD_PX = 0.4, 1.5
 """Fewer of a view's features that move as one, or less alike, and it says nothing: fog, another scene."""
 
 NEAREST_M, FARTHEST_M = 1.0, 30.0
-"""What is seen is taken to lie on level ground under the rover, within these ranges."""
+"""The scene is assumed to lie on level ground under the rover, within these ranges."""
 
 MOST_FEATURES = 60
 QUALITY, APART_PX, EDGE_PX = 0.02, 40, 26
 SEARCH_PX = 30.0
-"""How far a feature is looked for: a bump or slip of some 20 mrad in a Navcam."""
+"""How far a feature is searched for: a bump or slip of some 20 mrad in a Navcam."""
 
 FLOOR_PX = 0.03
 _RANGE_M = 5.0
@@ -59,17 +59,8 @@ _TUKEY = 4.0
 
 @dataclass(frozen=True, eq=False)
 class ViewShift:
-    """The features of one view, then and now.
-
-    camera, pose, pan_rad, tilt_rad
-        Who looked, at which of the reference rests, and where that was (true angles).
-    pixels_px
-        (n, 2) in the reference picture.
-    moved_px
-        (n, 2) now less then.
-    sigma_px
-        (n,) of each coordinate of ``moved_px``.
-    """
+    """The features of one view, a camera's at one of the reference rests (true angles): their pixels (n, 2)
+    in the reference picture, how far they have moved since (n, 2), and the sigma of its coordinates (n,)."""
 
     camera: str
     pose: int
@@ -150,33 +141,27 @@ def view_change(shift: ViewShift, size_px: tuple[int, int]) -> ViewChange | None
 def find_drift(rig: Rig, shifts: Sequence[ViewShift], joint_sigma_rad: float = JOINT_SIGMA_RAD) -> SceneDrift:
     """Return what differences between reference pictures and new ones say of a rig.
 
-    Parameters
-    ----------
-    rig
-        The mast file's.
-    shifts
-        The views, each camera at each rest once.
-    joint_sigma_rad
-        What a rest of the head is off by chance, then and now, one sigma.
+    ``shifts`` are of each camera at each rest once; ``joint_sigma_rad`` is what a rest of the head is off by
+    chance, then and now, one sigma.
     """
-    told: list[tuple[ViewShift, ViewChange]] = []
+    compared: list[tuple[ViewShift, ViewChange]] = []
     silent = []
     for shift in shifts:
         change = view_change(shift, rig.cameras[shift.camera].model.size_px)
         if change is None:
             silent.append(f"{shift.camera} at rest {shift.pose}")
         else:
-            told.append((shift, change))
-    if not told:
+            compared.append((shift, change))
+    if not compared:
         return SceneDrift(0, tuple(silent))
-    y = np.concatenate([change.numbers for _, change in told])
-    columns = _columns(rig, [shift for shift, _ in told])
-    covariance = _noise(told, columns, joint_sigma_rad)
+    y = np.concatenate([change.numbers for _, change in compared])
+    columns = _columns(rig, [shift for shift, _ in compared])
+    covariance = _noise(compared, columns, joint_sigma_rad)
     inverse = np.linalg.inv(covariance)
-    sizes_px = [rig.cameras[shift.camera].model.size_px for shift, _ in told]
+    sizes_px = [rig.cameras[shift.camera].model.size_px for shift, _ in compared]
     corner_px = np.array([np.hypot(width, height) / 2.0 for width, height in sizes_px])
     per_number = float(np.log(len(y)))  # what a number more must explain: Schwarz's criterion
-    best, drift = -np.inf, SceneDrift(len(told), tuple(silent))
+    best, drift = -np.inf, SceneDrift(len(compared), tuple(silent))
     for rates in _explanations(rig, columns):
         normal = rates.T @ inverse @ rates
         if np.linalg.cond(normal) > 1e12:
@@ -207,14 +192,14 @@ def _explanations(rig: Rig, columns: dict[str, FloatArray]) -> list[FloatArray]:
 
 
 def _noise(
-    told: Sequence[tuple[ViewShift, ViewChange]], columns: dict[str, FloatArray], joint_sigma_rad: float
+    compared: Sequence[tuple[ViewShift, ViewChange]], columns: dict[str, FloatArray], joint_sigma_rad: float
 ) -> FloatArray:
     """Covariance (4v, 4v): each view's own, and each rest's joint errors, of then and of now."""
-    size = 4 * len(told)
+    size = 4 * len(compared)
     covariance = np.zeros((size, size))
-    for at, (_, change) in enumerate(told):
+    for at, (_, change) in enumerate(compared):
         covariance[4 * at : 4 * at + 4, 4 * at : 4 * at + 4] = change.covariance
-    poses = np.repeat([shift.pose for shift, _ in told], 4)
+    poses = np.repeat([shift.pose for shift, _ in compared], 4)
     for pose in np.unique(poses):
         for joint in ("pan", "tilt"):
             mine = np.where(poses == pose, columns[joint], 0.0)
@@ -267,15 +252,8 @@ def _rates(pixels: FloatArray, size_px: tuple[int, int]) -> FloatArray:
 
 
 def seen_again(camera: CameraModel, then: Grey, now: Grey) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return features of a picture (n, 2), how far they have moved (n, 2) and its sigma (n,), all in pixels.
-
-    Parameters
-    ----------
-    camera
-        That took both, in any frame.
-    then, now
-        (h, w) grey.
-    """
+    """Return features of a camera's picture (n, 2), how far they have moved until another one of it (n, 2),
+    and its sigma (n,), all in pixels."""
     image = np.clip(np.rint(then), 0, 255).astype(np.uint8)
     corners = cv2.goodFeaturesToTrack(image, 4 * MOST_FEATURES, QUALITY, APART_PX, blockSize=15)
     pixels: list[FloatArray] = []
