@@ -27,6 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from calib.adjust.gross import bounded
 from calib.adjust.solver import Normal
 from calib.adjust.stacks import AnyStack, ImageStack, StationStack
 from calib.adjust.terms import (
@@ -98,23 +99,19 @@ class Adjustment:
 
     Parameters
     ----------
-    images, station
-        What was measured.
+    start
+        The state to start from; it settles which unknowns there are.
+    mast_parameters
+        4, 6 or 8; 0 leaves the mast as it is. Or which of its eight numbers move.
     prisms_cad_m, prism_cad_m
         The prisms from CAD, metres in the rover frame, and their sigma (0: exact). With a sigma, one that the
         start has and CAD has not is known by the station alone.
     joint_rad
         Sigma of a joint reading (0: exact).
-    mast_parameters
-        4, 6 or 8; 0 leaves the mast as it is. Or which of its eight numbers move.
     joint_errors
         Which of ``calib.geometry.rig.JOINTS_NAMES`` move.
-    bowed
-        Boards whose bow is unknown, by the first part of their images' ``board``.
-    fixed
-        Boards that stay where the start has them.
-    start
-        The state to start from; it settles which unknowns there are.
+    bowed, fixed
+        Boards whose bow is unknown, by the first part of their images' ``board``, and boards that stay.
     huber
         Length in sigmas from which pulls are bounded; None for plain least squares.
     """
@@ -586,4 +583,4 @@ def bounded_weights(residual: FloatArray, width: int, huber: float | None) -> Fl
     if huber is None:
         return np.ones(len(residual))
     length = np.linalg.norm(residual.reshape(-1, width), axis=1)
-    return np.repeat(np.minimum(1.0, huber / np.maximum(length, 1e-300)), width)
+    return np.repeat(bounded(length, huber), width)

@@ -38,6 +38,11 @@ def at_least_stated(squares: FloatArray, freedom: int = 2) -> float:
     return max(1.0, typical_scale(squares, freedom))
 
 
+def bounded(lengths: FloatArray, limit: ArrayLike) -> FloatArray:
+    """Return the weights (n,) of squares whose pull no longer grows from a length of ``limit`` on (Huber)."""
+    return np.asarray(np.minimum(1.0, limit / np.maximum(lengths, 1e-300)))
+
+
 def worst_first(keep: np.ndarray, ratios: Callable[[np.ndarray], FloatArray], most_out: float) -> np.ndarray:
     """Return which measurements (n,) agree.
 

@@ -33,9 +33,6 @@ from calib.geometry.significance import Level, chance
 EXPLAINS = 0.5
 """A hypothesis explains what a fit leaves if it takes away this part."""
 
-FEWEST = 4
-"""Of images or standstills, for a change among them to be looked for."""
-
 BEND_DEGREE = 4
 """Of the polynomials of the place in the picture by which a lens may be bent otherwise than modelled."""
 

@@ -21,7 +21,7 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc
 
 from calib.adjust.adjustment import Adjustment
-from calib.adjust.gross import GROSS
+from calib.adjust.gross import GROSS, bounded
 from calib.adjust.terms import ImageTerm, scattered_images, widened_images
 from calib.adjust.unknowns import Estimate
 from calib.geometry.rigid import FloatArray
@@ -190,7 +190,7 @@ def off_smooth(
         off = np.linalg.norm(terms @ numbers - values, axis=1)
         size = off / sigma
         size = size / max(1.0, float(np.median(size)))
-        weight = np.minimum(1.0, PULL / np.maximum(size, PULL)) ** 2 / sigma**2
+        weight = bounded(size, PULL) ** 2 / sigma**2
         if not (size > PULL).any():
             break
     root = np.sqrt(weight)[:, None]

@@ -238,8 +238,7 @@ def pixel_covariance(
 ) -> tuple[FloatArray, FloatArray]:
     """Return predicted pixels (n, 2) of rover-frame points (n, 3), metres, and covariances (n, 2, 2), px².
 
-    Only the calibration is uncertain; points and joint angles count as exact. Points that have no pixel come
-    out as not-a-number.
+    Points and joint angles are treated as exact; what has no pixel comes out as not-a-number.
     """
     rig, names = calibration.rig, calibration.parameter_names
     pixels, rates, _ = pixel_rates(rig, names, camera, pan_rad, tilt_rad, points_m)

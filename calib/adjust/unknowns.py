@@ -25,22 +25,18 @@ JOINT_ERRORS: Key = ("joints",)
 
 @dataclass(frozen=True, eq=False)
 class Unknown:
-    """One thing that a fit moves.
+    """One thing that a fit moves, its numbers named as a calibration names them (k,).
 
     Attributes
     ----------
-    key
-        What it is.
-    names
-        (k,) of its numbers, as a calibration names them.
     step
         (k,) how far each may be off at all: one that the data leave open stays where it is.
     prior, sigma
         (k,) what is known of the numbers beforehand, and how well; None where nothing is.
     kind
-        Of the measurement that says so (``calib.adjust.terms``); None for what such things are usually like.
+        Of the measurement that gives the prior (``calib.adjust.terms``); None for a usual value.
     usual
-        (k,) which numbers what lenses are usually like holds, however little the data show of them.
+        (k,) which numbers are held by what lenses are usually like, however little the data show of them.
     """
 
     key: Key

@@ -1,9 +1,9 @@
 """Correct the pose of a body pair from hand-offs: the paper's bias from two set-ups of the prisms.
 
-Weighted least squares for one rigid motion of the pair against the mast cameras, which hold the rover frame.
-Targets at one range cannot separate a turn from a shift; a prior says how far two prism set-ups can disagree,
-and directions in which the hand-offs add little to it are named. The significance is that of the directions
-that the hand-offs do see, against no motion at all.
+Weighted least squares for one rigid motion of the pair against the mast cameras, which define the rover
+frame. Targets at one range cannot separate a turn from a shift; a prior says how far two prism set-ups can
+disagree, and directions in which the hand-offs add little to it are named. The significance is that of the
+directions that the hand-offs do see, against no motion at all.
 
 The corrected rig's covariance: with e what the rig's parameters are wrong by, the hand-offs' residuals are G
 e + noise, and the step is K times them. The remainder e - LK (G e + noise) has the covariance (1 - LKG) P (1
@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
-from calib.adjust.gross import worst_first
+from calib.adjust.gross import bounded, worst_first
 from calib.calibrate.body_sights import BodySights, Equations, body_sights
 from calib.errors import NoCorrection
 from calib.geometry.covariance import MOST_SIGMAS, RigCovariance, click_rates, pixel_rates
@@ -93,18 +93,14 @@ class BodyPose:
 
     Attributes
     ----------
-    cameras, origin_m
-        Which move, and (3,) the middle of their centres before, rover frame: the turn is about it.
-    step
-        (6,) rotation vector, radians, and shift, metres, rover axes.
-    covariance
-        (6, 6) of the step, with the prior.
+    origin_m
+        (3,) the middle of the moved cameras' centres before, rover frame: the turn is about it.
+    step, covariance
+        (6,) rotation vector, radians, and shift, metres, rover axes; (6, 6) with the prior.
     gain
         (6, n, 2k): by the residuals of the used hand-offs the step is gain times these.
     motion
         The same motion of the cameras as a transform in the rover frame.
-    used, outliers
-        The hand-offs that were, and those that were not.
     rms_px
         Camera to ((x, y) before, (x, y) after), over the used hand-offs.
     chi2_before, chi2_after, degrees_of_freedom
@@ -112,11 +108,9 @@ class BodyPose:
     scale
         ``chi2_after`` over its degrees of freedom where that is above 1: the covariance is widened by it.
     chance, sigmas
-        Of hand-offs without any motion that look as moved as these, and the same in sigmas.
+        Of hand-offs without any motion that seem as moved as these, and the same in sigmas.
     seen, unseen
         How many of the six directions the hand-offs see, and a sentence for each that they do not.
-    cameras_apart
-        For a pair that both found a target of.
     """
 
     cameras: tuple[str, ...]
@@ -147,14 +141,9 @@ class BodyPose:
 def fit_body_pose(rig: Rig, cameras: Sequence[str], handoffs: Sequence[MatchedHandoff]) -> BodyPose:
     """Fit the rigid motion of body cameras that brings geometric hand-offs to where pictures show targets.
 
-    Parameters
-    ----------
-    rig
-        As believed so far; its mast and head cameras stay.
-    cameras
-        The body cameras that move as one, see `calib.calibrate.body_sights.body_groups`.
-    handoffs
-        With accepted matches in those cameras, from pairs on the head; others are passed over.
+    The rig's mast and head cameras stay; the body ``cameras`` move as one, see
+    `calib.calibrate.body_sights.body_groups`. Hand-offs without accepted matches in those cameras, or not
+    from a pair on the head, are passed over.
 
     Raises
     ------
@@ -169,8 +158,8 @@ def fit_body_pose(rig: Rig, cameras: Sequence[str], handoffs: Sequence[MatchedHa
     if np.mean(~keep) > MOST_OUTLIERS:
         raise NoCorrection(
             "inconsistent",
-            f"{np.sum(~keep)} of {len(keep)} hand-offs to {' and '.join(cameras)} contradict the rest; look "
-            "at them before anything is corrected by them",
+            f"{np.sum(~keep)} of {len(keep)} hand-offs to {' and '.join(cameras)} contradict the rest; check "
+            "them before anything is corrected by them",
         )
     used = every.part(keep)
     _enough(used)
@@ -261,7 +250,7 @@ def _fit(sights: BodySights, robust: bool = False) -> _BodyFit:
         weights = np.ones(len(numbers))
         if robust:
             statistics = _normal(at, weights)[2] / scale
-            weights = np.minimum(1.0, np.sqrt(bend / np.maximum(statistics, 1e-300)))
+            weights = np.sqrt(bounded(statistics, bend))
         information, gradient, _ = _normal(at, weights)
         normal = information / scale + _PRIOR
         change = np.linalg.solve(normal, gradient / scale - _PRIOR @ step)
@@ -345,7 +334,7 @@ def _correction(used: BodySights, fit: _BodyFit, outliers: tuple[LeftOutHandoff,
 
 
 def _sentence(direction: FloatArray) -> str:
-    """A direction that the hand-offs leave to the prior, in words."""
+    """A direction that the hand-offs leave to the prior."""
     toward = direction * np.sign(direction[np.argmax(np.abs(direction))])
     large = sorted(zip(-np.abs(toward), toward, STEP_NAMES, strict=True))
     parts = [f"{weight:+.2f} {name}" for size, weight, name in large if size < -0.3]
@@ -383,15 +372,7 @@ def corrected_rig(rig: Rig, correction: BodyPose) -> Rig:
 
 
 def corrected_covariance(rig: Rig, known: RigCovariance, correction: BodyPose) -> RigCovariance:
-    """Return the covariance of the corrected rig's parameters.
-
-    Parameters
-    ----------
-    rig, known
-        Before the correction.
-    correction
-        Of cameras of that rig.
-    """
+    """Return the covariance of the corrected rig's parameters; ``rig`` and ``known`` are those before."""
     size = len(known.names)
     per_step, carried = np.zeros((size, 6)), np.eye(size)
     at = {name: i for i, name in enumerate(known.names)}

@@ -49,16 +49,12 @@ class Equations(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class BodySights:
-    """The sights of a body pair's cameras.
+    """The sights of a body pair's cameras (k,) by hand-offs (n,).
 
     Attributes
     ----------
-    cameras
-        (k,) names.
     origin_m
-        (3,) middle of their centres, rover frame.
-    handoffs
-        (n,) those with at least one accepted match and a source on the head.
+        (3,) middle of the cameras' centres, rover frame.
     positions_m, covariances_m2, rates_m_per_px
         (n, 3), (n, 3, 3) and (n, 3, 4): the targets by the source pairs, from clicks and joint readings.
     found_px, noise_px2, seen

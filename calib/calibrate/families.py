@@ -33,17 +33,11 @@ MOST_IMAGES, MOST_POINTS = 20, 40
 
 @dataclass(frozen=True)
 class FamilyScore:
-    """One family.
+    """One family, of so many numbers a camera.
 
-    Attributes
-    ----------
-    kind, parameters
-        The model, and how many numbers a camera of it has.
-    left_out_px
-        How far points of pictures that the fit has not seen are typically from their prediction, an axis,
-        as one sigma.
-    by_image_px2
-        The typical square by image, pixels squared; not-a-number where the family gave none.
+    ``left_out_px`` is how far points of pictures that the fit has not seen are typically from their
+    prediction, an axis, as one sigma, ``by_image_px2`` the typical square by image; not-a-number where the
+    family gave none.
     """
 
     kind: Kind
@@ -60,14 +54,8 @@ def compare_families(
 ) -> tuple[FamilyScore, ...]:
     """Return how well each family predicts the images of one camera, in the order of ``kinds``.
 
-    Parameters
-    ----------
-    images
-        Of one camera; at least five, boards flat.
-    size_px, focal_px
-        Of the camera; the focal length may be some 20 % off.
-    kinds
-        Families; one that explains no images is left out.
+    There are at least five images, of flat boards. The focal length may be some 20 % off. A family that
+    explains no images is left out.
     """
     some = np.unique(np.linspace(0, len(images) - 1, min(MOST_IMAGES, len(images))).astype(int))
     images = [thinned(images[at], MOST_POINTS) for at in some]

@@ -25,16 +25,10 @@ def refuse_far(
 ) -> None:
     """Raise if a camera's typical dot is far above its noise, or too many of its images were left out.
 
-    Parameters
-    ----------
-    stated_px
-        No dot's own sigma counts as less: what neighbours share, as a print's errors, is not in it.
-    most
-        How many times the noise the typical dot may be off. Stated sigmas are wrong by two or three, wrong
-        minima by a hundred.
-    dot, disagree, scatter, coherent
-        What a dot is called; what to check where images disagree, where dots are off one by one, and where
-        they are off together.
+    No dot's own sigma counts as less than ``stated_px``: what neighbours share, as a print's errors, is not
+    in it. The typical dot may be off ``most`` times the noise: stated sigmas are wrong by two or three, wrong
+    minima by a hundred. ``disagree``, ``scatter`` and ``coherent`` say what to check where images disagree,
+    where dots are off one by one, and where they are off together.
 
     Raises
     ------

@@ -53,14 +53,7 @@ PART = 4
 
 
 def fit_bench(survey: Survey, options: BenchOptions | None = None) -> BenchCalibration:
-    """Fit a rig to a bench's pictures, every measurement weighted by its sigma.
-
-    Parameters
-    ----------
-    survey
-        With ``boards`` and ``corners``; check images take no part.
-    options
-        What is chosen.
+    """Fit a rig to a bench's pictures, every measurement weighted by its sigma; check images take no part.
 
     Raises
     ------
@@ -80,7 +73,7 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     """Fit everything, choose, fit again, and put together what it says."""
     candidates = bench.candidates()
     bench, problem, start = _look_for_changes(bench, candidates)
-    _refuse_far(bench, problem, start)  # before blunders are looked for one by one where nothing fits
+    _refuse_far(bench, problem, start)  # where nothing fits, before blunders are searched for one by one
     cleaned = without_blunders(problem, start, bench.terms.images, bench.survey.sigma.corner_px)
     chosen, tests = choose_terms(cleaned.problem, cleaned.fit, candidates)
     dropped = {name: term for name, term in candidates.items() if name not in chosen}
@@ -116,7 +109,7 @@ def _look_for_changes(
             order_px = bench.survey.sigma.corner_px
             problem, _, _ = with_scales(problem, fit.state, bench.terms.images, order_px)
             fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-4)
-        problem = _without_lone_strays(problem, fit.state).with_huber(SCAN_HUBER)
+        problem = _without_lone_corners(problem, fit.state).with_huber(SCAN_HUBER)
         fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-6)
         if not np.isfinite(fit.normal.cost) or not left:
             break
@@ -150,7 +143,7 @@ def _refuse_slip(bench: BenchProblem, state: Estimate) -> None:
             )
 
 
-def _without_lone_strays(problem: Adjustment, state: Estimate) -> Adjustment:
+def _without_lone_corners(problem: Adjustment, state: Estimate) -> Adjustment:
     """Leave out corners far off in images of which most corners are less so."""
     terms = []
     for t, residual in zip(problem.images, problem.residuals(state, problem.images), strict=True):

@@ -92,7 +92,7 @@ def bench_terms(survey: Survey) -> BenchTerms:
 
 
 MOVES = 4
-"""Boards that moved are looked for so many times."""
+"""Boards that moved are searched for so many times."""
 
 TURNABOUTS = 0.34
 """A board stood at two places in turn if no cut divides its pictures but for this part of the fewer ones."""
@@ -106,11 +106,9 @@ class BenchOptions:
     ----------
     kind
         Camera model of all cameras; None: as the survey says for each.
-    rover_from_mast
-        Where the rover frame is: the mast's frame at zero angles in it, as a level and a tape give it.
-        Default: it is the mast's.
-    rover_from_board
-        Or the board and placement whose pose is known, and that pose.
+    rover_from_mast, rover_from_board
+        Where the rover frame is: the mast's frame at zero angles in it, as a level and a tape give it (by
+        default it is the mast's), or the board and placement whose pose is known, and that pose.
     """
 
     kind: Kind | None = None
@@ -274,12 +272,12 @@ class BenchProblem:
 
 
 def _one_sided(term: str, joint: str, sides: set[int]) -> str:
-    """Why a joint's backlash is not looked for."""
+    """Why a joint's backlash is not fitted."""
     if not sides & {-1, 1}:
-        return f"{term} is not looked for: it is not known from which side {joint} came to rest"
+        return f"{term} is not fitted: it is not known from which side {joint} came to rest"
     side = "smaller" if 1 in sides else "larger"
     return (
-        f"{term} is not looked for: {joint} came to rest from {side} angles only, as in a head that "
+        f"{term} is not fitted: {joint} came to rest from {side} angles only, as in a head that "
         "approaches every goal from one side. Its play is then part of its zero, and no error"
     )
 

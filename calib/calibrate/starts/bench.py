@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.adjust.gross import gross_limit
+from calib.adjust.gross import bounded, gross_limit
 from calib.adjust.terms import ImageTerm
 from calib.adjust.uncertainty import SEEN_RAD
 from calib.adjust.unknowns import Estimate
@@ -76,16 +76,9 @@ class _Tied(NamedTuple):
 
 
 def bench_start(images: Sequence[ImageTerm], views: Mapping[str, ViewPoses], attitudes: int) -> BenchStart:
-    """Return where to start the fit of a bench.
+    """Return where to start the fit of a bench from what each camera says by itself.
 
-    Parameters
-    ----------
-    images
-        All that are fitted; a head camera's have an attitude.
-    views
-        By camera what it says by itself.
-    attitudes
-        How many head attitudes have angles of their own; 0 where readings are exact.
+    ``attitudes`` is how many of the head have angles of their own; 0 where readings are exact.
 
     Raises
     ------
@@ -174,7 +167,7 @@ def _tie(images: Sequence[ImageTerm], view: ViewPoses) -> _Tied:
         seen = np.array([pose.rotation for pose in chosen])
         off = _angles(gimbals @ in_head @ seen, in_mast[at])
         typical = max(float(np.median(off)), SMALLEST)
-        weight = 0.5 * typical / np.maximum(off, 0.5 * typical)
+        weight = bounded(off, 0.5 * typical)
     shifts = np.array([pose.translation_m for pose in chosen])
     place, places = _places(
         gimbals, gimbals @ in_head, shifts, at, len(boards), off < gross_limit(off, SMALLEST)
@@ -234,7 +227,7 @@ def _places(
         )[0]
         off = np.linalg.norm(rows @ solved - wanted, axis=1)
         typical = max(float(np.median(off[good])), SMALLEST)
-        weight = np.where(good, np.sqrt(1.0 / np.maximum(off, typical) * typical), 0.0)
+        weight = np.where(good, np.sqrt(bounded(off, typical)), 0.0)
     return solved[:3], solved[3:].reshape(-1, 3)
 
 

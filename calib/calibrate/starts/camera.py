@@ -41,15 +41,8 @@ def fit_camera(
 ) -> Agreed:
     """Fit a camera that stood still to images of boards whose poses are known, in the boards' frame.
 
-    Parameters
-    ----------
-    images
-        Blunders come by whole images.
-    kind, size_px, focal_px
-        What camera to fit; the focal length may be some 20 % off. A CAHVORE is fitted as a fish-eye
-        (type 2), and as type 1 if that does not fit.
-    expected_px
-        Residual of a coordinate to expect. A fit more than six times above it is refused.
+    The focal length may be some 20 % off. A CAHVORE is fitted as a fish-eye (type 2), and as type 1 if that
+    does not fit. A fit that leaves more than six times ``expected_px``, of a coordinate, is refused.
 
     Raises
     ------

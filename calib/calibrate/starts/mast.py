@@ -96,15 +96,9 @@ def fit_mast(
 ) -> Agreed:
     """Fit 4, 6 or 8 numbers of the mast to images at many joint angles, the cameras taken as known.
 
-    Parameters
-    ----------
-    images
-        Of cameras with references; those at their camera's reference angles say nothing.
-    mast_parameters
-        4 for a mast that stands upright (θx = θy = 0), which need not explain anything: no image is left out
-        and no fit refused; 6 for the paper's, 8 for two skew axes.
-    expected_px
-        Residual of a coordinate to expect.
+    Images at their camera's reference angles say nothing. With 4 parameters the mast stands upright
+    (θx = θy = 0) and need not explain anything: no image is left out and no fit refused. ``expected_px`` is
+    the residual of a coordinate to expect.
 
     Raises
     ------

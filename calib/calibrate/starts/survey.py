@@ -41,18 +41,15 @@ class Start:
 
     Attributes
     ----------
-    images, checks, station
-        Terms, all dots of the images among them; of check images wrong ones are gone.
-    fitted
-        The images with those dots that the steps were made with.
+    images, checks, fitted
+        All images with every dot, check images without wrong ones, and the images with those dots that the
+        steps were made with.
     camera_images
         Names of the images that cameras were fitted to.
-    estimate, references
-        The state, and the cameras in the rover frame at the joint setting at which they were calibrated.
+    references
+        The cameras in the rover frame at the joint setting at which they were calibrated.
     doubtful
         Images that did not agree, by name how far off (rms of distances, pixels) they may be.
-    poses
-        Of set-ups and boards.
     wrong
         Dots of all images that disagree with the rest of theirs.
     """

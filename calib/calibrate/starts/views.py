@@ -36,18 +36,11 @@ class ViewsTooFew(CalibError):
 
 @dataclass(frozen=True, eq=False)
 class ViewPoses:
-    """One camera by itself.
+    """One camera by itself, with C at the origin and A along z.
 
-    Attributes
-    ----------
-    model
-        The camera with C at the origin, looking along z.
-    poses
-        By image name camera_from_board: the likeliest, and the other one if it is nearly as good.
-    wrong
-        By image name which of its points (n,) disagree with the rest of it, where any do.
-    doubtful
-        Images that no pose explains.
+    ``poses`` are by image name camera_from_board: the likeliest, and the other one if it is nearly as good.
+    ``wrong`` says by image name which of its points (n,) disagree with the rest of it, where any do;
+    ``doubtful`` are images that no pose explains.
     """
 
     model: CameraModel
@@ -64,16 +57,10 @@ def view_poses(
     *,
     images_for_lens: int = IMAGES_FOR_LENS,
 ) -> ViewPoses:
-    """Return a camera and where the board stood in each of its images.
+    """Return a camera and where the board, which is flat, stood in each of its images.
 
-    Parameters
-    ----------
-    images
-        Of one camera; boards are flat.
-    kind, size_px, focal_px
-        What camera; the focal length may be some 20 % off, or None where nothing is known of it.
-    images_for_lens
-        How many images the lens is fitted to at most.
+    The focal length may be some 20 % off, or None where nothing is known of it. The lens is fitted to
+    ``images_for_lens`` of the images at most.
 
     Raises
     ------

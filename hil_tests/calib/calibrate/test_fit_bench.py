@@ -146,7 +146,7 @@ def test_a_board_may_have_the_name_of_another_term() -> None:
         )
         fit = fit_bench(renamed)
         assert [note for note in fit.notes if "backlash" in note] == [
-            note for note in fit.notes if note.startswith("tilt backlash is not looked for")
+            note for note in fit.notes if note.startswith("tilt backlash is not fitted")
         ]
         (bows[board],) = (t for t in fit.terms if t.name == f"bow of {board}")
     for board, bow in bows.items():
