@@ -22,7 +22,7 @@ say what is.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -33,7 +33,7 @@ from calib.adjust.gross import GROSS, MANY, at_least_stated, chance_limit
 from calib.adjust.left_out import LeftOut, left_out, statistics
 from calib.adjust.scatter import scatter
 from calib.adjust.terms import ImageTerm, StationTerm
-from calib.adjust.unknowns import Estimate, ResidualBlock
+from calib.adjust.unknowns import Estimate
 from calib.geometry.rigid import FloatArray
 from calib.geometry.significance import Level, typical_scale
 
@@ -78,26 +78,58 @@ PRISMS_LEFT = 3
 """A set-up keeps at least so many prisms: with fewer nothing says which of them is wrong."""
 
 
-@dataclass(frozen=True, eq=False)
-class JudgedImage:
-    """An image, chi-square of each dot by itself (n,), and the dots as the other measurements predict them,
-    together."""
+class _Tests:
+    """Every image and every station point at a fitted state, tested by the rest.
 
-    term: ImageTerm
-    dots: FloatArray
-    predicted: LeftOut
+    Where the typical measurement is farther off than its sigma says, limits are wider by as much.
+    """
 
-    def whole(self, fitted: bool, limits: _Limits) -> tuple[np.ndarray, float, float, bool]:
+    def __init__(
+        self, problem: Adjustment, state: Estimate, covariance: FloatArray, all_images: Sequence[ImageTerm]
+    ) -> None:
+        self.images = problem.images
+        self.dots: list[FloatArray] = []
+        self.predicted: list[LeftOut] = []
+        fitted: dict[str, list[FloatArray]] = {term.camera: [np.zeros(0)] for term in problem.images}
+        for block, term in zip(problem.blocks_of(state, all_images), problem.images, strict=True):
+            mine = covariance[np.ix_(block.columns, block.columns)]
+            self.dots.append(statistics(block.residual, block.jacobian, mine, term.keep)[0])
+            self.predicted.append(left_out(block, mine, term.keep, problem.huber))
+            fitted[term.camera].append(self.dots[-1][term.keep])
+        self.points: list[tuple[float, int]] = []
+        for block, point in zip(problem.blocks_of(state, problem.station), problem.station, strict=True):
+            mine = covariance[np.ix_(block.columns, block.columns)]
+            one, freedom = statistics(block.residual, block.jacobian, mine, np.array([point.keep]))
+            self.points.append((float(one[0]), int(freedom[0])))
+        typical = {camera: np.concatenate(mine) for camera, mine in fitted.items()}
+        whole = at_least_stated(np.concatenate([np.zeros(0), *typical.values()]))
+        self._dot_scales = {
+            camera: max(whole, min(typical_scale(mine), GROSS**2)) for camera, mine in typical.items()
+        }
+        kept = zip(self.points, problem.station, strict=True)
+        self._point_scale = at_least_stated(np.array([s for (s, n), p in kept if p.keep and n == 3]), 3)
+
+    def dot_limit(self, camera: str) -> float:
+        """Beyond what a dot fails."""
+        return chance_limit(Level.MEASUREMENT, sum(map(len, self.dots))) * self._dot_scales[camera]
+
+    def point_limit(self, freedom: int) -> float:
+        """Beyond what a prism or tape fails of which so many numbers are checked."""
+        return chance_limit(Level.MEASUREMENT, len(self.points), freedom) * self._point_scale
+
+    def image(self, index: int) -> tuple[np.ndarray, float, float, bool]:
         """Which dots (n,) are good; chi-square of these together, or of all if too many are not, and its
         limit; and whether the image fails."""
-        most = limits.dot(self.term.camera)
-        good = self.dots <= most
-        if not fitted:
-            good = self.predicted.agreeing(good, most)
+        term, predicted = self.images[index], self.predicted[index]
+        most = self.dot_limit(term.camera)
+        good = self.dots[index] <= most
+        if not term.keep.any():
+            good = predicted.agreeing(good, most)
         many_bad = bool(good.mean() < 1 - MANY)
-        statistic, freedom = self.predicted.statistic(np.isfinite(self.dots) if many_bad else good)
-        own = scatter(self.term, self.predicted.residual, good)
-        limit = limits.image(self.term.camera, freedom, min(own.square, GROSS**2) if own else 1.0)
+        statistic, freedom = predicted.statistic(np.isfinite(self.dots[index]) if many_bad else good)
+        own = scatter(term, predicted.residual, good)
+        scale = max(self._dot_scales[term.camera], min(own.square, GROSS**2) if own else 1.0)
+        limit = chance_limit(Level.WHOLE, len(self.images), max(freedom, 1)) * scale
         return good, statistic, limit, many_bad or statistic > limit
 
 
@@ -109,42 +141,29 @@ def judge(
     What the fit's terms keep was not left out so far. ``all_images`` are the problem's in its order, with
     every dot that was measured.
     """
-    seen, points, limits = _tested(problem, state, covariance, all_images)
-    images, worst, worst_excess = [], None, 0.0
-    bad_dots: list[tuple[int, np.ndarray]] = []
-    for index, (term, judged) in enumerate(zip(problem.images, seen, strict=True)):
-        good, statistic, limit, fails = judged.whole(bool(term.keep.any()), limits)
-        images.append(term)
-        if not term.keep.any():
-            if not fails:
-                images[index] = replace(term, keep=good)
-        elif fails:
+    tests = _Tests(problem, state, covariance, all_images)
+    images, station = list(problem.images), list(problem.station)
+    suspect, excess = None, 0.0
+    for index, term in enumerate(problem.images):
+        good, statistic, limit, fails = tests.image(index)
+        if not fails:
+            images[index] = replace(term, keep=good)
+        elif term.keep.any() and (suspect is None or statistic - limit > excess):
             # The sum of squares falls by that much without it: most without the one that pulls others along.
-            if worst is None or statistic - limit > worst_excess:
-                worst, worst_excess = ("image", index), statistic - limit
-        elif (good != term.keep).any():
-            bad_dots.append((index, good))
-    readmitted = []
-    image_failed, worst_ratio = worst is not None, 1.0
-    for index, (point, (statistic, freedom)) in enumerate(zip(problem.station, points, strict=True)):
-        if not freedom:
-            continue
-        ratio = statistic / limits.point(freedom)
-        # A tape or prism cannot pull hundreds of dots along: where an image fails, it goes first.
-        if point.keep and not image_failed and ratio > worst_ratio and _may_go(problem, point):
-            worst, worst_ratio = ("station", index), ratio
+            suspect, excess = index, statistic - limit
+    if suspect is not None:
+        suspect = _culprit(problem, state, suspect)
+        images[suspect] = replace(images[suspect], keep=np.zeros_like(images[suspect].keep))
+    worst, worst_ratio = None, 1.0
+    for index, (point, (statistic, freedom)) in enumerate(zip(problem.station, tests.points, strict=True)):
+        ratio = statistic / tests.point_limit(freedom) if freedom else np.inf
         if not point.keep and ratio <= 1.0:
-            readmitted.append(index)
-    station = list(problem.station)
-    for index in readmitted:
-        station[index] = replace(station[index], keep=True)
-    if worst is not None and worst[0] == "image":
-        worst = ("image", _culprit(problem, state, worst[1]))
-        images[worst[1]] = replace(images[worst[1]], keep=np.zeros_like(images[worst[1]].keep))
-    elif worst is not None:
-        station[worst[1]] = replace(station[worst[1]], keep=False)
-    for index, good in bad_dots:
-        images[index] = replace(images[index], keep=good)
+            station[index] = replace(point, keep=True)
+        # A tape or prism cannot pull hundreds of dots along: where an image fails, it goes first.
+        if point.keep and freedom and suspect is None and ratio > worst_ratio and _may_go(problem, point):
+            worst, worst_ratio = index, ratio
+    if worst is not None:
+        station[worst] = replace(station[worst], keep=False)
     return images, station
 
 
@@ -155,96 +174,27 @@ def name_outliers(
     found: list[Outlier] = []
     if all(t.keep.all() for t in problem.images) and all(p.keep for p in problem.station):
         return ()
-    seen, points, limits = _tested(problem, state, covariance, all_images)
-    for whole, term, judged in zip(all_images, problem.images, seen, strict=True):
+    tests = _Tests(problem, state, covariance, all_images)
+    for index, (whole, term) in enumerate(zip(all_images, problem.images, strict=True)):
         if term.keep.all():
             continue
-        residual = problem.residuals(state, [whole])[0].reshape(-1, 2) * whole.sigma_px[:, None]
+        off_px = problem.residuals(state, [whole])[0].reshape(-1, 2) * whole.sigma_px[:, None]
         if not term.keep.any():
-            _, statistic, limit, _ = judged.whole(False, limits)
-            size = float(np.sqrt(np.mean(np.sum(residual**2, axis=1))))
+            _, statistic, limit, _ = tests.image(index)
+            size = float(np.sqrt(np.mean(np.sum(off_px**2, axis=1))))
             found.append(Outlier("image", f"image {term.name}", statistic, limit, size))
             continue
         for row in np.flatnonzero(~term.keep):
-            name = f"image {term.name} {term.part(int(row))}"
-            size = float(np.linalg.norm(residual[row]))
-            found.append(Outlier("dot", name, float(judged.dots[row]), limits.dot(term.camera), size))
-    for point, (statistic, freedom) in zip(problem.station, points, strict=True):
-        if point.keep:
-            continue
-        limit = limits.point(freedom or 3)
-        size = float(np.linalg.norm(problem.residuals(state, [point])[0]) * point.sigma_m)
-        kind: Literal["prism", "tape"] = "prism" if point.board is None else "tape"
-        found.append(Outlier(kind, point.name, statistic, limit, size))
+            name, size = f"image {term.name} {term.part(int(row))}", float(np.linalg.norm(off_px[row]))
+            found.append(
+                Outlier("dot", name, float(tests.dots[index][row]), tests.dot_limit(term.camera), size)
+            )
+    for point, (statistic, freedom) in zip(problem.station, tests.points, strict=True):
+        if not point.keep:
+            size = float(np.linalg.norm(problem.residuals(state, [point])[0]) * point.sigma_m)
+            kind: Literal["prism", "tape"] = "prism" if point.board is None else "tape"
+            found.append(Outlier(kind, point.name, statistic, tests.point_limit(freedom or 3), size))
     return tuple(found)
-
-
-@dataclass(frozen=True)
-class _Limits:
-    """Beyond what a statistic fails: a dot's, and an image's and a station point's by their freedom.
-
-    Where the typical measurement is farther off than its sigma says, they are wider by as much.
-    """
-
-    dots: int
-    images: int
-    points: int
-    dot_scales: Mapping[str, float]
-    point_scale: float
-
-    def dot(self, camera: str) -> float:
-        return chance_limit(Level.MEASUREMENT, self.dots) * self.dot_scales[camera]
-
-    def image(self, camera: str, freedom: int, own: float) -> float:
-        limit = chance_limit(Level.WHOLE, self.images, max(freedom, 1))
-        return limit * max(self.dot_scales[camera], own)
-
-    def point(self, freedom: int) -> float:
-        return chance_limit(Level.MEASUREMENT, self.points, freedom) * self.point_scale
-
-
-def _tested(
-    problem: Adjustment, state: Estimate, covariance: FloatArray, all_images: Sequence[ImageTerm]
-) -> tuple[list[JudgedImage], list[tuple[float, int]], _Limits]:
-    """Every image; every station point's chi-square and its degrees of freedom; and the limits."""
-
-    def tested(block: ResidualBlock, fitted: np.ndarray) -> tuple[FloatArray, np.ndarray]:
-        mine = covariance[np.ix_(block.columns, block.columns)]
-        return statistics(block.residual, block.jacobian, mine, fitted)
-
-    seen = [
-        JudgedImage(
-            term,
-            tested(block, term.keep)[0],
-            left_out(block, covariance[np.ix_(block.columns, block.columns)], term.keep, problem.huber),
-        )
-        for block, term in zip(problem.blocks_of(state, all_images), problem.images, strict=True)
-    ]
-    points = [
-        (float(statistic[0]), int(freedom[0]))
-        for block, term in zip(problem.blocks_of(state, problem.station), problem.station, strict=True)
-        for statistic, freedom in [tested(block, np.array([term.keep]))]
-    ]
-    whole = [s for (s, freedom), t in zip(points, problem.station, strict=True) if t.keep and freedom == 3]
-    count = sum(len(one.dots) for one in seen)
-    dot_scales = _typical_dots(zip(seen, problem.images, strict=True))
-    point_scale = at_least_stated(np.array(whole), 3)
-    return seen, points, _Limits(count, len(seen), len(points), dot_scales, point_scale)
-
-
-def _typical_dots(seen: Iterable[tuple[JudgedImage, ImageTerm]]) -> dict[str, float]:
-    """By camera how much larger the square of its typical dot that was fitted is than its sigma makes it."""
-    by_camera: dict[str, list[FloatArray]] = {}
-    for judged, term in seen:
-        mine = by_camera.setdefault(term.camera, [])
-        if term.keep.any():
-            mine.append(judged.dots[term.keep])
-    every = [dots for mine in by_camera.values() for dots in mine]
-    whole = at_least_stated(np.concatenate(every or [np.ones(0)]))
-    return {
-        camera: max(whole, min(typical_scale(np.concatenate(mine or [np.ones(0)])), GROSS**2))
-        for camera, mine in by_camera.items()
-    }
 
 
 def _culprit(problem: Adjustment, state: Estimate, suspect: int) -> int:
