@@ -160,14 +160,14 @@ def without_blunders(
     """Fit with pulls bounded, find each image's sigma, judge, and fit again until nothing fails.
 
     ``problem`` has stated sigmas, ``all_images`` are its images with every dot, ``start`` is a state that
-    blunders may have moved, ``order_px`` as of `calib.adjust.scatter.scales`.
+    blunders may have moved, ``order_px`` as of `calib.adjust.scatter.with_scales`.
     """
     fit = minimise(problem, start, weak=problem.weak, gain=1e-7)
     _refuse_lost(fit)
-    problem, images, found = with_scales(problem, fit.state, all_images, order_px)
+    problem, images, cameras = with_scales(problem, fit.state, all_images, order_px)
     for huber in (HUBER, None):
         problem, fit = judged(problem.with_huber(huber), fit.state, images)
-    return Cleaned(problem, fit, images, found.cameras)
+    return Cleaned(problem, fit, images, cameras)
 
 
 def judged_again(cleaned: Cleaned, problem: Adjustment, start: Estimate) -> Cleaned:

@@ -50,13 +50,6 @@ class Scatter(NamedTuple):
     freedom: float
 
 
-class Scales(NamedTuple):
-    """By camera what its dots' stated sigmas have to be multiplied by, and by image besides."""
-
-    cameras: Mapping[str, float]
-    images: Mapping[str, float]
-
-
 def scatter(image: ImageTerm, residual: FloatArray, judged: np.ndarray | None = None) -> Scatter | None:
     """Return how much an image's dots scatter, their residuals (2n,) being in its sigmas; None of too few.
 
@@ -67,23 +60,42 @@ def scatter(image: ImageTerm, residual: FloatArray, judged: np.ndarray | None = 
     degree = next((degree for fewest, degree in DEGREES if seen.sum() >= fewest), 0)
     if not degree:
         return None
-    places = image.in_board_m[seen, :2]
-    middle = places.mean(axis=0)
-    size = max(float(np.abs(places - middle).max()), 1e-9)
-    statistic, _ = off_smooth((places - middle) / size, off[seen], np.ones(int(seen.sum())), degree)
+    statistic, _ = off_smooth(image.in_board_m[seen, :2], off[seen], np.ones(int(seen.sum())), degree)
     kept = statistic if judged is not None else statistic[statistic <= BEYOND**2 * typical_scale(statistic)]
     taken = (degree + 1) * (degree + 2)
     return Scatter(float(kept.mean()) / 2.0, float(2 * len(kept) - taken)) if 2 * len(kept) > taken else None
 
 
-def scales(found: Mapping[str, tuple[ImageTerm, Scatter]], order_px: float) -> Scales:
-    """Return the scales of cameras and images.
+def own_scales(
+    problem: Adjustment,
+    state: Estimate,
+    images: Sequence[ImageTerm],
+    cameras: Mapping[str, float],
+    order_px: float,
+) -> dict[str, float]:
+    """Return by image what its stated sigmas count times beside its camera's: of images that were not fitted.
 
-    ``found`` is by image its term, with stated sigmas, and how much it scatters in these; ``order_px`` what
-    the survey states of all its dots, one sigma.
+    ``cameras`` is by kind of measurement what stated sigmas count times, ``order_px`` as of `with_scales`.
     """
-    cameras: dict[str, float] = {}
-    images: dict[str, float] = {}
+    found = scattering(problem, state, images)
+    return {
+        name: _own(one, cameras.get(term.kind, 1.0), np.inf, _most(term, order_px))
+        for name, (term, one) in found.items()
+    }
+
+
+def with_scales(
+    problem: Adjustment, state: Estimate, images: Sequence[ImageTerm], order_px: float
+) -> tuple[Adjustment, tuple[ImageTerm, ...], dict[str, float]]:
+    """Return a problem and all its images, with every dot, by sigmas as large as their scatter shows; and by
+    kind of measurement what the stated sigmas of all count times.
+
+    ``images`` are the problem's in its order, with every dot and stated sigmas, ``state`` is a first fit:
+    what is left of an image may be large, but has to be smooth. ``order_px`` is what the survey states of all
+    its dots, one sigma.
+    """
+    found = scattering(problem, state, images)
+    cameras, own = dict[str, float](), dict[str, float]()
     for kind in dict.fromkeys(term.kind for term, _ in found.values()):
         mine = {name: one for name, (term, one) in found.items() if term.kind == kind}
         squares, freedom = np.array(list(mine.values())).T
@@ -98,40 +110,10 @@ def scales(found: Mapping[str, tuple[ImageTerm, Scatter]], order_px: float) -> S
         cameras[kind] = min(float(np.sqrt(typical)), *most)
         sure = np.inf if typical == 1.0 else max(together, 1.0)
         for name, limit in zip(mine, most, strict=True):
-            images[name] = _own(mine[name], cameras[kind], sure, limit)
-    return Scales(cameras, {name: own for name, own in images.items() if own != 1.0})
-
-
-def own_scales(
-    problem: Adjustment,
-    state: Estimate,
-    images: Sequence[ImageTerm],
-    cameras: Mapping[str, float],
-    order_px: float,
-) -> dict[str, float]:
-    """Return by image what its stated sigmas count times beside its camera's: of images that were not fitted.
-
-    ``cameras`` is by kind of measurement what stated sigmas count times, ``order_px`` as of `scales`.
-    """
-    found = scattering(problem, state, images)
-    return {
-        name: _own(one, cameras.get(term.kind, 1.0), np.inf, _most(term, order_px))
-        for name, (term, one) in found.items()
-    }
-
-
-def with_scales(
-    problem: Adjustment, state: Estimate, images: Sequence[ImageTerm], order_px: float
-) -> tuple[Adjustment, tuple[ImageTerm, ...], Scales]:
-    """Return a problem and all its images, with every dot, by sigmas as large as their scatter shows.
-
-    ``images`` are the problem's in its order, with every dot and stated sigmas, ``state`` is a first fit:
-    what is left of an image may be large, but has to be smooth. ``order_px`` is as of `scales`.
-    """
-    found = scales(scattering(problem, state, images), order_px)
-    every = widened_images(scattered_images(images, found.images), found.cameras)
+            own[name] = _own(mine[name], cameras[kind], sure, limit)
+    every = widened_images(scattered_images(images, own), cameras)
     kept = [replace(whole, keep=term.keep) for whole, term in zip(every, problem.images, strict=True)]
-    return problem.with_terms(kept, problem.station), every, found
+    return problem.with_terms(kept, problem.station), every, cameras
 
 
 def scattering(
@@ -178,10 +160,11 @@ def off_smooth(
     """Return how far points are from a polynomial of the others: chi-square of two degrees of freedom (n,),
     and the distance (n,).
 
-    ``places`` (n, 2), of the order of one, are where each point is, ``values`` (n, 2) what is smooth over
-    these, ``sigma`` (n,) that of a value's coordinate.
+    ``places`` (n, 2) are where each point is, ``values`` (n, 2) what is smooth over these, ``sigma`` (n,)
+    that of a value's coordinate.
     """
-    x, y = places.T
+    aside = places - places.mean(axis=0)
+    x, y = (aside / max(float(np.abs(aside).max()), 1e-9)).T
     terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=1)
     weight = 1 / sigma**2
     for _ in range(STEPS):

@@ -39,11 +39,8 @@ def wrong_dots(images: Sequence[ImageTerm]) -> tuple[dict[str, np.ndarray], tupl
         if found is None:
             continue
         degree, gross = found
-        places = image.in_board_m[:, :2] - image.in_board_m[:, :2].mean(axis=0)
         sigma_px = np.hypot(image.sigma_px, POLYNOMIAL_PX)
-        statistic, off_px = off_smooth(
-            places / max(np.abs(places).max(), 1e-9), image.pixels_px, sigma_px, int(degree)
-        )
+        statistic, off_px = off_smooth(image.in_board_m[:, :2], image.pixels_px, sigma_px, int(degree))
         limit = gross**2 * at_least_stated(statistic)
         bad = np.asarray(statistic > limit)
         if bad.any() and bad.mean() <= MANY:
