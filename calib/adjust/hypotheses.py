@@ -12,7 +12,7 @@ board is seen by nothing and does no harm.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -258,10 +258,9 @@ class ScoredFit:
         """The images of one camera by the rates of their residuals."""
         return self.rows(rates, lambda image: image.camera == name)
 
-    def of_board(self, board: tuple[str, str]) -> list[Effect]:
-        """The images of one board, by its pose."""
-        key = ("board", board)
-        return self.rows(lambda _, motions: motions.block.rates(key), lambda image: image.board == board)
+    def of_board(self, board: tuple[str, str], rates: Rates) -> list[Effect]:
+        """The images of one board by the rates of their residuals."""
+        return self.rows(rates, lambda image: image.board == board)
 
     def _row(self, image: ImageTerm, block: ResidualBlock, rates: FloatArray, moves: FloatArray) -> Effect:
         sigma_px = np.repeat(image.sigma_px[image.keep], 2)[:, None]
@@ -378,10 +377,10 @@ def _of_surveys(fit: ScoredFit) -> Iterator[Hypothesis]:
     if fit.readings:
         yield from _harmonics(fit)
         yield from _readings(fit)
-        yield from _joints(fit, "slip", "from", _slip_sentence)
+        yield from _joints(fit, "slip")
     yield from _drifts(fit)
     yield from _lenses(fit)
-    yield from _cameras(fit, "change", "from", _change_sentence)
+    yield from _cameras(fit, "change")
     yield from _board_shape(fit)
     yield from _moved_before_tapes(fit)
     yield from _drawing(fit)
@@ -389,10 +388,7 @@ def _of_surveys(fit: ScoredFit) -> Iterator[Hypothesis]:
 
 def _drifts(fit: ScoredFit) -> Iterator[Hypothesis]:
     """Joints and cameras that change more with every picture."""
-    for what in (
-        *_joints(fit, "drift", "always", _joint_drift_sentence),
-        *_cameras(fit, "drift", "always", _camera_drift_sentence),
-    ):
+    for what in (*_joints(fit, "drift"), *_cameras(fit, "drift")):
         yield replace(what, rows=[row.drifting() for row in what.rows])
 
 
@@ -400,46 +396,58 @@ def _placements(fit: ScoredFit) -> Iterator[Hypothesis]:
     """Placements whose pictures see other cameras, axes and joints than those of the others."""
     compared = fit.problem.unknowns.of_kinds("mast", "joints", "camera")
     boards = dict.fromkeys(image.board for image in fit.images)
+
+    def own(_: ImageTerm, motions: Motions) -> FloatArray:
+        rates = np.zeros((len(motions.block.residual), len(fit.gradient)))
+        rates[:, motions.block.columns] = motions.block.jacobian
+        return rates[:, compared]
+
+    def sentence(found: Finding) -> str:
+        return (
+            f"{found.name} contradicts the others: its pictures say something else of cameras, axes and "
+            f"joints (chi-square {found.gain:.0f} for {found.numbers} numbers). Check that it is the same "
+            "board and that nothing changed in between, and put it up there once more"
+        )
+
     for board in boards if len(boards) > 1 else ():
-
-        def own(_: ImageTerm, motions: Motions) -> FloatArray:
-            rates = np.zeros((len(motions.block.residual), len(fit.gradient)))
-            rates[:, motions.block.columns] = motions.block.jacobian
-            return rates[:, compared]
-
-        rows = fit.rows(own, lambda image, board=board: image.board == board)  # type: ignore[misc]
         name = f"placement {board[1]} of {board[0]}"
-        yield Hypothesis(name, ("board", *board), rows, _contradiction_sentence)
+        yield Hypothesis(name, ("board", *board), fit.of_board(board, own), sentence)
 
 
 def _changes(fit: ScoredFit) -> Iterator[Hypothesis]:
     """The changes between two pictures that are looked for where a fit fails; one picture is a blunder."""
+
+    def sentence(found: Finding) -> str:
+        _, board, placement = found.subject
+        return (
+            f"board {board} moved during placement {placement}, between pictures {found.before} and "
+            f"{found.after}, by about {_milli(found.values[3:])} mm and {_milli(found.values[:3])} mrad"
+        )
+
     for board in dict.fromkeys(image.board for image in fit.images):
         if board not in fit.problem.fixed:
-            rows = fit.of_board(board)
-            yield Hypothesis("board moved", ("board", *board), rows, _board_sentence, "from", side=2)
+            rows = fit.of_board(board, lambda image, motions: motions.block.rates(("board", image.board)))
+            yield Hypothesis("board moved", ("board", *board), rows, sentence, "from", side=2)
     if not fit.problem.upright:
         yield from _axes(fit)
-    yield from _joints(fit, "slip", "from", _slip_sentence, side=2)
-    yield from _cameras(fit, "change", "from", _change_sentence, side=2)
+    yield from _joints(fit, "slip", side=2)
+    yield from _cameras(fit, "change", side=2)
 
 
-def _joints(
-    fit: ScoredFit, what: str, course: Course, sentence: Callable[[Finding], str], side: int = 1
-) -> Iterator[Hypothesis]:
+def _joints(fit: ScoredFit, what: Literal["slip", "drift"], side: int = 1) -> Iterator[Hypothesis]:
     """Of each joint that it reads otherwise."""
+    course: Course = "from" if what == "slip" else "always"
     for joint, name in enumerate(("pan", "tilt") if fit.readings else ()):
         rows = [row.part([joint]) for row in fit.readings]
-        yield Hypothesis(f"{what} of {name}", ("joint", name), rows, sentence, course, side)
+        yield Hypothesis(f"{what} of {name}", ("joint", name), rows, SENTENCES["joint", what], course, side)
 
 
-def _cameras(
-    fit: ScoredFit, what: str, course: Course, sentence: Callable[[Finding], str], side: int = 1
-) -> Iterator[Hypothesis]:
+def _cameras(fit: ScoredFit, what: Literal["change", "drift"], side: int = 1) -> Iterator[Hypothesis]:
     """Of each camera that has images left that its focal length and direction are others."""
+    course: Course = "from" if what == "change" else "always"
     for name in fit.cameras:
         rows = fit.of_camera(name, lambda _, motions: motions.camera)
-        yield Hypothesis(f"{what} of {name}", ("camera", name), rows, sentence, course, side)
+        yield Hypothesis(f"{what} of {name}", ("camera", name), rows, SENTENCES["camera", what], course, side)
 
 
 def _axes(fit: ScoredFit) -> Iterator[Hypothesis]:
@@ -462,10 +470,7 @@ def _axes(fit: ScoredFit) -> Iterator[Hypothesis]:
 
 def _on_head(fit: ScoredFit, numbers: Sequence[int]) -> list[Effect]:
     """The head's images by some of the numbers that move it."""
-    rows = fit.rows(
-        lambda image, motions: motions.head[:, numbers] if image.attitude is not None else motions.head
-    )
-    return [row for row, image in zip(rows, fit.images, strict=True) if image.attitude is not None]
+    return fit.rows(lambda _, motions: motions.head[:, numbers], lambda image: image.attitude is not None)
 
 
 def _harmonics(fit: ScoredFit) -> Iterator[Hypothesis]:
@@ -606,48 +611,25 @@ def _milli(size: FloatArray) -> str:
     return f"{length:.1f}" if length >= 1.0 else f"{length:.2g}"
 
 
-def _board_sentence(found: Finding) -> str:
-    _, board, placement = found.subject
-    return (
-        f"board {board} moved during placement {placement}, between pictures {found.before} and "
-        f"{found.after}, by about {_milli(found.values[3:])} mm and {_milli(found.values[:3])} mrad"
-    )
-
-
-def _contradiction_sentence(found: Finding) -> str:
-    return (
-        f"{found.name} contradicts the others: its pictures say something else of cameras, axes and joints "
-        f"(chi-square {found.gain:.0f} for {found.numbers} numbers). Check that it is the same board and "
-        "that nothing changed in between, and put it up there once more"
-    )
-
-
-def _slip_sentence(found: Finding) -> str:
-    return (
+SENTENCES: Mapping[tuple[str, str], Callable[[Finding], str]] = {
+    ("joint", "slip"): lambda found: (
         f"{found.subject[1]} slipped by about {_milli(found.values)} mrad between pictures "
         f"{found.before} and {found.after}: the head no longer points where it read before; tighten what "
         "holds it on its axis and take the pictures again"
-    )
-
-
-def _joint_drift_sentence(found: Finding) -> str:
-    return (
+    ),
+    ("joint", "drift"): lambda found: (
         f"{found.subject[1]} drifts off its reading, by {1e3 * found.values[0]:+.2f} mrad from the first "
         "picture to the last: a mount or an encoder creeps; fasten it and take the pictures again"
-    )
-
-
-def _change_sentence(found: Finding) -> str:
-    return (
+    ),
+    ("camera", "change"): lambda found: (
         f"from picture {found.after} on {found.subject[1]} is another camera (focal length "
         f"{100 * found.values[0]:+.2f} %, turned by {_milli(found.values[1:])} mrad): it was refocused or "
         "knocked there; fasten it and take the pictures again"
-    )
-
-
-def _camera_drift_sentence(found: Finding) -> str:
-    return (
+    ),
+    ("camera", "drift"): lambda found: (
         f"camera {found.subject[1]} drifts from the first picture to the last. Its focal length changes by "
         f"{100 * found.values[0]:+.3f} %, and it turns by {_milli(found.values[1:])} mrad; let it warm up, "
         "fasten it, and take the pictures again"
-    )
+    ),
+}
+"""The sentences on what changes with time, of a joint or a camera."""
