@@ -37,6 +37,7 @@ from calib.adjust.terms import (
     StationTerm,
     lens_knowledge,
     widened_images,
+    with_kept,
 )
 from calib.adjust.unknowns import (
     JOINT_ERRORS,
@@ -384,12 +385,11 @@ class Adjustment:
             found |= {id(t): block for t, block in zip(stack.terms, blocks, strict=True)}
         return [found[id(term)] for term in terms]
 
-    def unseen(self, state: Estimate) -> set[str]:
-        """The images in which a dot that counts has no pixel, by name."""
-        off = self.residuals(state, self.images)
-        return {
-            t.name for t, residual in zip(self.images, off, strict=True) if not np.isfinite(residual).all()
-        }
+    def without_unseen(self, state: Estimate) -> Adjustment:
+        """Return the same problem without images in which a dot that counts has no pixel."""
+        off = zip(self.images, self.residuals(state, self.images), strict=True)
+        unseen = {term.name for term, residual in off if not np.isfinite(residual).all()}
+        return self.with_terms(with_kept(self.images, unseen), self.station)
 
     def _blocks(self, state: Estimate, stack: AnyStack) -> Iterator[ResidualBlock]:
         """The terms of a stack, each by itself."""

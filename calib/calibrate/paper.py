@@ -55,24 +55,20 @@ def fit_paper(survey: Survey, mast_parameters: int = 6) -> Calibration:
     start = start_values(survey, mast_parameters, by_purpose=True)
     state = start.estimate
     blunders = {o.name for o in start.poses.blunders}
-    problem = Adjustment(
-        start.fitted,
-        [replace(p, keep=p.name not in blunders) for p in start.station],
-        state,
-        mast_parameters=mast_parameters if start.references.joints_rad else 0,
-        prisms_cad_m=survey.prisms_in_rover_m,
-        prism_cad_m=survey.sigma.prism_cad_m,
-        joint_rad=survey.sigma.joint_rad,
-    )
+    problem = start.problem(survey, mast_parameters)
+    station = [replace(p, keep=p.name not in blunders) for p in problem.station]
+    problem = problem.with_terms(problem.images, station)
     whole, mast_alone = two_step_covariance(problem, state, start.references, start.camera_images)
     images = image_residuals(survey, problem, state, start.images, start.checks)
     in_sigmas = [
         np.sum((i.residuals_px[i.used] / i.sigma_px[i.used, None]) ** 2) for i in images if i.used.any()
     ]
     count = sum(2 * int(i.used.sum()) for i in images)
-    kinds, notes = ("mast", "camera"), (*start.notes, *_bent_notes(start))
+    kinds = ("mast", "camera")
     return Calibration(
-        **fitted_fields(survey, problem, state, whole, images, start.checks, kinds, Level.STATED, notes),
+        **fitted_fields(
+            survey, problem, state, whole, images, start.checks, kinds, Level.STATED, start.notes
+        ),
         **station_fields(survey, problem, state),
         method="paper",
         mast_parameters=mast_parameters,
@@ -120,15 +116,6 @@ def two_step_covariance(
     alone = np.zeros((total, total))
     alone[np.ix_(rig, rig)] = dots
     return rates @ errors @ rates.T, rates @ alone @ rates.T
-
-
-def _bent_notes(start: Start) -> list[str]:
-    """Why the images of a board whose tapes cannot be right were left out."""
-    return [
-        f"the tapes of placement {placement} (set-up {setup}) do not have the board's shape and three cannot "
-        "show which is wrong: its images were not used"
-        for setup, placement in sorted(start.poses.bent)
-    ]
 
 
 def _left_out(images: Sequence[ImageResiduals], start: Start) -> list[Outlier]:

@@ -25,7 +25,6 @@ from calib.adjust.hypotheses import (
 from calib.adjust.result import Calibration
 from calib.adjust.robust import Cleaned, SurveyNotFitted, Weighed, weigh, weighed_fields, without_blunders
 from calib.adjust.solver import minimise
-from calib.adjust.terms import with_kept
 from calib.adjust.uncertainty import station_fields
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.refusals import refuse_far, refuse_unsettled
@@ -58,7 +57,7 @@ def fit_joint(survey: Survey, mast_parameters: int = 6) -> Calibration:
     """
     began = time.perf_counter()
     start = start_values(survey, mast_parameters)
-    problem = joint_problem(survey, start, mast_parameters)
+    problem = start.problem(survey, mast_parameters).with_huber(HUBER).without_unseen(start.estimate)
     cleaned = without_blunders(problem, start.estimate, start.images, survey.sigma.dot_px)
     change = _what_changed(cleaned)
     _refuse_wrong_minimum(cleaned.problem, cleaned.fit.state, survey.sigma.dot_px, change)
@@ -66,22 +65,6 @@ def fit_joint(survey: Survey, mast_parameters: int = 6) -> Calibration:
     weighed = weigh(cleaned)
     refuse_unsettled(weighed.fit, "joint angles and distances")
     return _calibration(survey, mast_parameters, start, cleaned, weighed, change, began)
-
-
-def joint_problem(survey: Survey, start: Start, mast_parameters: int) -> Adjustment:
-    """Return the least-squares problem of a survey, without images that disagree with the start."""
-    problem = Adjustment(
-        start.fitted,
-        start.station,
-        start.estimate,
-        mast_parameters=mast_parameters if start.references.joints_rad else 0,
-        prisms_cad_m=survey.prisms_in_rover_m,
-        prism_cad_m=survey.sigma.prism_cad_m,
-        joint_rad=survey.sigma.joint_rad,
-        huber=HUBER,
-    )
-    unseen = problem.unseen(start.estimate)
-    return problem.with_terms(with_kept(problem.images, unseen), problem.station)
 
 
 def _what_changed(cleaned: Cleaned) -> Finding | None:
@@ -94,9 +77,8 @@ def _what_changed(cleaned: Cleaned) -> Finding | None:
     if len(kept) - sum(kept) < FEW_LEFT_OUT:
         return None
     station = [replace(point, keep=True) for point in cleaned.problem.station]
-    every = cleaned.problem.with_terms(cleaned.images, station)
-    whole = with_kept(every.images, every.unseen(cleaned.fit.state))
-    every = every.with_terms(whole, every.station).with_huber(SCAN_HUBER)
+    every = cleaned.problem.with_terms(cleaned.images, station).with_huber(SCAN_HUBER)
+    every = every.without_unseen(cleaned.fit.state)
     fit = minimise(every, cleaned.fit.state, weak=every.weak, gain=1e-6)
     change = find_change(ScoredFit(every, fit.state)) if np.isfinite(fit.normal.cost) else None
     return change if change is not None and change.subject[0] != "board" else None

@@ -102,7 +102,7 @@ def _look_for_changes(
     """
     wrong = {n: s for view in bench.views.values() for n, s in view.wrong.items()}
     for left in range(MOVES, -1, -1):
-        problem = bench.seen(chosen, bench.start)
+        problem = bench.problem(chosen, bench.start).without_unseen(bench.start)
         problem = problem.with_terms([without_wrong(t, wrong) for t in problem.images], ())
         fit = minimise(problem, bench.start, weak=problem.weak, gain=1e-4)
         if np.isfinite(fit.normal.cost):

@@ -252,11 +252,6 @@ class BenchProblem:
             huber=HUBER,
         )
 
-    def seen(self, chosen: Mapping[str, ModelTerm], start: Estimate) -> Adjustment:
-        """The problem without images whose corners have no pixel at the start."""
-        problem = self.problem(chosen, start)
-        return problem.with_terms(with_kept(problem.images, problem.unseen(start)), ())
-
     def candidates(self) -> dict[str, ModelTerm]:
         """Terms that pictures could determine: backlash only where the axis came from both sides."""
         found = {}

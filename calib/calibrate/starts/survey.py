@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calib.adjust.adjustment import Adjustment
 from calib.adjust.outliers import Outlier
 from calib.adjust.robust import SurveyNotFitted
 from calib.adjust.terms import ImageTerm, StationTerm, image_terms, station_terms
@@ -65,6 +66,18 @@ class Start:
     poses: StationPoses
     wrong: tuple[Outlier, ...]
     notes: tuple[str, ...]
+
+    def problem(self, survey: Survey, mast_parameters: int) -> Adjustment:
+        """Return the least-squares problem of everything that the steps were made with."""
+        return Adjustment(
+            self.fitted,
+            self.station,
+            self.estimate,
+            mast_parameters=mast_parameters if self.references.joints_rad else 0,
+            prisms_cad_m=survey.prisms_in_rover_m,
+            prism_cad_m=survey.sigma.prism_cad_m,
+            joint_rad=survey.sigma.joint_rad,
+        )
 
 
 def start_values(survey: Survey, mast_parameters: int, *, by_purpose: bool = False) -> Start:

@@ -13,7 +13,7 @@ from calib.adjust.solver import Normal, minimise
 from calib.adjust.terms import lens_knowledge
 from calib.adjust.unknowns import MAST
 from calib.calibrate.starts.survey import start_values
-from calib.calibrate.survey import fit_joint, joint_problem
+from calib.calibrate.survey import fit_joint
 from calib.geometry.parameters import parameter_names, stepped
 from calib.geometry.rig import Rig
 from calib.survey.records import Sigma, Survey
@@ -43,7 +43,7 @@ def survey(true_rig: Rig) -> Survey:
 
 @pytest.fixture(scope="module")
 def problem(survey: Survey) -> Adjustment:
-    return joint_problem(survey, start_values(survey, 8), 8)
+    return start_values(survey, 8).problem(survey, 8)
 
 
 def test_every_derivative_is_that_of_differences(problem: Adjustment, survey: Survey) -> None:

@@ -289,7 +289,7 @@ def test_a_drift_of_many_numbers_has_to_explain_more_than_a_change_of_few() -> N
 def test_a_camera_without_a_picture_left_is_asked_for_no_drift() -> None:
     plan = BenchPlan(attitudes=8, checks=0)
     bench = BenchProblem(simulate_bench(1, replace(plan, placements=plan.placements[:2])), BenchOptions())
-    problem = bench.seen({}, bench.start)
+    problem = bench.problem({}, bench.start).without_unseen(bench.start)
     left = [replace(t, keep=t.keep & (t.camera == "navcam_left")) for t in problem.images]
     drifts = find_drifts(ScoredFit(problem.with_terms(left, ()), bench.start))
     assert {drift.subject[1] for drift in drifts} == {"pan", "tilt", "navcam_left"}
