@@ -23,7 +23,7 @@ from calib.adjust.unknowns import MAST, Estimate
 from calib.geometry.covariance import pixel_rates
 from calib.geometry.landing import landing_rates
 from calib.geometry.parameters import parameter_names, parameter_part
-from calib.geometry.rig import Rig, gimbal
+from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, tangents
 from calib.geometry.significance import Level
 from calib.survey.records import Click, Survey
@@ -150,16 +150,14 @@ def unseen_clicks(survey: Survey, state: Estimate) -> tuple[Click, ...]:
 def _check_clicks(survey: Survey, state: Estimate) -> Iterator[tuple[Click, str, FloatArray]]:
     """Each click on a check point with its camera and what it is off by (1, 2), pixels."""
     points = {(p.setup, p.point): p.position_m for p in survey.station if p.kind == "check"}
-    by_name = {i.name: i for i in survey.images}
+    by_name, rig = {i.name: i for i in survey.images}, rig_of(survey, state)
     for click in survey.clicks:
         image = by_name.get(click.image)
         if image is None or (image.setup, click.point) not in points or image.camera not in state.cameras:
             continue
         in_rover = state.rover_from_station[image.setup].points(points[image.setup, click.point])[None]
-        if image.pan_rad is not None and image.tilt_rad is not None:
-            head = gimbal(state.mast, image.pan_rad, image.tilt_rad)
-            in_rover = (in_rover - head.translation_m) @ head.rotation
-        pixel, valid = state.cameras[image.camera].project(in_rover)
+        camera = rig.camera_in_rover(image.camera, image.pan_rad or 0.0, image.tilt_rad or 0.0)
+        pixel, valid = camera.project(in_rover)
         yield click, image.camera, np.where(valid[:, None], pixel, np.nan) - click.pixel_px
 
 

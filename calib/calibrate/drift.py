@@ -162,7 +162,7 @@ def find_drift(rig: Rig, shifts: Sequence[ViewShift], joint_sigma_rad: float = J
     corner_px = np.array([np.hypot(width, height) / 2.0 for width, height in sizes_px])
     per_number = float(np.log(len(y)))  # what a number more must explain: Schwarz's criterion
     best, drift = -np.inf, SceneDrift(len(compared), tuple(silent))
-    for rates in _explanations(rig, columns):
+    for rates in columns.values():
         normal = rates.T @ inverse @ rates
         if np.linalg.cond(normal) > 1e12:
             continue
@@ -180,17 +180,6 @@ def find_drift(rig: Rig, shifts: Sequence[ViewShift], joint_sigma_rad: float = J
     return drift
 
 
-def _explanations(rig: Rig, columns: dict[str, FloatArray]) -> list[FloatArray]:
-    """Of each change that is tested: how the views' numbers (4v,) follow it (4v, k)."""
-    found = []
-    for name, camera in rig.cameras.items():
-        if camera.on == "head" and f"cameras.{name}.turn.x" in columns:
-            found.append(np.column_stack([columns[f"cameras.{name}.turn.{axis}"] for axis in "xyz"]))
-            found.append(columns[f"cameras.{name}.scale"][:, None])
-    found += [columns[joint][:, None] for joint in ("pan", "tilt")]
-    return [*found, np.column_stack([columns[f"rover.{axis}"] for axis in "xyz"])]
-
-
 def _noise(
     compared: Sequence[tuple[ViewShift, ViewChange]], columns: dict[str, FloatArray], joint_sigma_rad: float
 ) -> FloatArray:
@@ -202,21 +191,23 @@ def _noise(
     poses = np.repeat([shift.pose for shift, _ in compared], 4)
     for pose in np.unique(poses):
         for joint in ("pan", "tilt"):
-            mine = np.where(poses == pose, columns[joint], 0.0)
+            mine = np.where(poses == pose, columns[joint][:, 0], 0.0)
             covariance += 2.0 * joint_sigma_rad**2 * np.outer(mine, mine)
     return covariance
 
 
 def _columns(rig: Rig, shifts: Sequence[ViewShift]) -> dict[str, FloatArray]:
-    """By number that may change: how the views' numbers follow it (4v,)."""
+    """By change that is tested: how the views' numbers follow those that change (4v, k)."""
     views = [_responses(rig, shift) for shift in shifts]
-    names = list(dict.fromkeys(name for view in views for name in view))
-    nothing = np.zeros(4)
-    return {name: np.concatenate([view.get(name, nothing) for view in views]) for name in names}
+    shapes = {name: rates.shape for view in views for name, rates in view.items()}
+    return {
+        name: np.concatenate([view.get(name, np.zeros(shape)) for view in views])
+        for name, shape in shapes.items()
+    }
 
 
 def _responses(rig: Rig, shift: ViewShift) -> dict[str, FloatArray]:
-    """By number that may change: how a view's four numbers, taken from its own features, follow it."""
+    """By change that is tested: how a view's four numbers, taken from its own features, follow it (4, k)."""
     camera = rig.cameras[shift.camera]
     rays = rig.camera_in_rover(shift.camera, shift.pan_rad, shift.tilt_rad).ray(shift.pixels_px)
     points = rays.origins_m + _ranges_m(rays.origins_m, rays.directions)[:, None] * rays.directions
@@ -224,13 +215,18 @@ def _responses(rig: Rig, shift: ViewShift) -> dict[str, FloatArray]:
     seen = pixel_rates(rig, (*JOINT_NAMES, *own), shift.camera, shift.pan_rad, shift.tilt_rad, points)
     # The rover carries the camera: points move the other way before it.
     by_rover = -rigid_rates(seen.to_points, points, np.zeros(3))[..., :3]
-    names, moved_px = ["pan", "tilt", *(f"rover.{axis}" for axis in "xyz")], [seen.to_rig[..., :2], by_rover]
+    moved_px = {"pan": seen.to_rig[..., :1], "tilt": seen.to_rig[..., 1:2], "rover": by_rover}
     if camera.on == "head":
-        names += [f"cameras.{shift.camera}.{part}" for part in ("scale", "turn.x", "turn.y", "turn.z")]
-        moved_px.append(seen.to_rig[..., 2:] @ focus_and_turn_rates(camera.model))
-    by_number = np.nan_to_num(np.concatenate(moved_px, axis=2)).reshape(-1, len(names))
+        by_camera = seen.to_rig[..., 2:] @ focus_and_turn_rates(camera.model)
+        moved_px |= {
+            f"scale of {shift.camera}": by_camera[..., :1],
+            f"turn of {shift.camera}": by_camera[..., 1:],
+        }
     rates = _rates(shift.pixels_px, camera.model.size_px).reshape(-1, 4)
-    return dict(zip(names, np.linalg.lstsq(rates, by_number, rcond=None)[0].T, strict=True))
+    return {
+        name: np.asarray(np.linalg.lstsq(rates, np.nan_to_num(moved).reshape(len(rates), -1), rcond=None)[0])
+        for name, moved in moved_px.items()
+    }
 
 
 def _ranges_m(origins_m: FloatArray, directions: FloatArray) -> FloatArray:
