@@ -53,6 +53,12 @@ class ImageTerm:
             return f"corner {self.ids[index]}"
         return f"dot (row {self.rows[index]}, column {self.columns[index]})"
 
+    def kept(self, good: np.ndarray) -> ImageTerm:
+        """Return the image with those of its dots that count (k,) which are good."""
+        keep = self.keep.copy()
+        keep[keep] = good
+        return replace(self, keep=keep)
+
     def only(self, good: np.ndarray) -> ImageTerm:
         """Return the image with some of its dots (n,), as if it had no others."""
         names = ("rows", "columns", "in_board_m", "pixels_px", "sigma_px", "keep", "bend", "ids")

@@ -146,14 +146,9 @@ def _refuse_slip(bench: BenchProblem, state: Estimate) -> None:
 def _without_lone_corners(problem: Adjustment, state: Estimate) -> Adjustment:
     """Leave out corners far off in images of which most corners are less so."""
     terms = []
-    for t, residual in zip(problem.images, problem.residuals(state, problem.images), strict=True):
-        if not t.keep.any():
-            terms.append(t)
-            continue
-        length = np.linalg.norm(residual.reshape(-1, 2), axis=1)
-        keep = t.keep.copy()
-        keep[keep] = length < gross_limit(length, 1.0)
-        terms.append(replace(t, keep=keep))
+    for t, off in zip(problem.images, problem.residuals(state, problem.images), strict=True):
+        length = np.linalg.norm(off.reshape(-1, 2), axis=1)
+        terms.append(t.kept(length < gross_limit(length, 1.0)) if len(length) else t)
     return problem.with_terms(terms, ())
 
 

@@ -72,8 +72,7 @@ def fit_agreeing(
     for _ in range(2):  # a point that only an unfinished lens puts elsewhere comes back
         before = kept
         kept = tuple(
-            _kept(t, (off < LONE * limit_px) & good)
-            for t, off, good in zip(images, offs, agrees, strict=True)
+            t.kept((off < LONE * limit_px) & good) for t, off, good in zip(images, offs, agrees, strict=True)
         )
         if sum(t.keep.any() for t in kept) < min(2, len(images)) or sum(t.keep.sum() for t in kept) < 8:
             return None
@@ -130,11 +129,4 @@ def _bounded(image: ImageTerm, distance_px: FloatArray, typical_px: float) -> Im
     """The image with the sigma of each point as large as its distance asks."""
     sigma = image.sigma_px.copy()
     sigma[image.keep] = np.maximum(np.hypot(typical_px, distance_px / 2), sigma[image.keep])
-    return replace(_kept(image, np.isfinite(distance_px)), sigma_px=sigma)
-
-
-def _kept(image: ImageTerm, good: np.ndarray) -> ImageTerm:
-    """The image with those of the points that count which are good."""
-    keep = image.keep.copy()
-    keep[image.keep] = good
-    return replace(image, keep=keep)
+    return replace(image.kept(np.isfinite(distance_px)), sigma_px=sigma)
