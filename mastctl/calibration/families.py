@@ -21,7 +21,7 @@ def compared(survey: Survey) -> dict[str, tuple[FamilyScore, ...]]:
     """
     terms: tuple[ImageTerm, ...]
     if survey.boards:
-        terms = bench_terms(survey).images
+        terms = tuple(bench_terms(survey, [])[0])
     else:
         anywhere = {(image.setup, image.placement): Rigid.identity() for image in survey.images}
         terms = tuple(image_terms(survey, anywhere, [])[0])

@@ -74,7 +74,7 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     candidates = bench.candidates()
     bench, problem, start = _look_for_changes(bench, candidates)
     _refuse_far(bench, problem, start)  # where nothing fits, before blunders are searched for one by one
-    cleaned = without_blunders(problem, start, bench.terms.images, bench.survey.sigma.corner_px)
+    cleaned = without_blunders(problem, start, bench.images, bench.survey.sigma.corner_px)
     chosen, tests = choose_terms(cleaned.problem, cleaned.fit, candidates)
     dropped = {name: term for name, term in candidates.items() if name not in chosen}
     start = without_terms(cleaned.fit.state, dropped)
@@ -107,7 +107,7 @@ def _look_for_changes(
         fit = minimise(problem, bench.start, weak=problem.weak, gain=1e-4)
         if np.isfinite(fit.normal.cost):
             order_px = bench.survey.sigma.corner_px
-            problem, _, _ = with_scales(problem, fit.state, bench.terms.images, order_px)
+            problem, _, _ = with_scales(problem, fit.state, bench.images, order_px)
             fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-4)
         problem = _without_lone_corners(problem, fit.state).with_huber(SCAN_HUBER)
         fit = minimise(problem, fit.state, weak=problem.weak, gain=1e-6)
@@ -120,8 +120,7 @@ def _look_for_changes(
             break  # the verdict names what drifts, with its size
         if change.subject[0] != "board":
             raise SomethingChanged(change.sentence)
-        bench.notes.append(f"{change.sentence}; from there on it counts as another placement")
-        bench.split_placement((change.subject[1], change.subject[2]), change.after)
+        bench.split_placement((change.subject[1], change.subject[2]), change.after, change.sentence)
         bench.begin()
     return bench, problem.with_huber(HUBER), fit.state
 
@@ -205,7 +204,7 @@ def _calibration(
             )
     # A parameter that is not seen keeps what is weakly known of it, and is reported as open.
     kinds = ("mast", "joints", "camera")
-    images, checks = bench.terms.images, bench.terms.checks
+    images, checks = bench.images, bench.checks
     fields = weighed_fields(
         bench.survey, cleaned.as_stated(), weighed, images, checks, kinds, Level.PREDICTED, bench.notes
     )

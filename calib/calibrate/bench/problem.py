@@ -26,26 +26,15 @@ FEWEST_CORNERS = 6
 """An image with fewer takes no part: with four, a pose goes through them whatever they are."""
 
 
-@dataclass(frozen=True, eq=False)
-class BenchTerms:
-    """Images that are fitted, those that are not (purpose ``check``), the number of the head's standstills
-    among the former, and sentences on images that say nothing."""
-
-    images: tuple[ImageTerm, ...]
-    checks: tuple[ImageTerm, ...]
-    attitudes: int
-    notes: tuple[str, ...]
-
-
-def bench_terms(survey: Survey) -> BenchTerms:
-    """Return a bench's terms, in the order in which its images were taken.
+def bench_terms(survey: Survey, notes: list[str]) -> tuple[list[ImageTerm], list[ImageTerm], int]:
+    """Return terms of the fitted and of the check images of a bench, in the order in which these were taken,
+    and the number of the head's standstills among the former.
 
     Images of several cameras that follow each other at one placement and reading belong to one standstill:
     what a reading is off is the same for all of them.
     """
     fitted: list[ImageTerm] = []
     checks: list[ImageTerm] = []
-    notes: list[str] = []
     standstill, shown, count = None, set[tuple[str, str]](), 0
     for image in survey.images:
         corners = survey.corners.get(image.name)
@@ -88,7 +77,7 @@ def bench_terms(survey: Survey) -> BenchTerms:
             corners.ids,
         )
         (checks if check else fitted).append(term)
-    return BenchTerms(tuple(fitted), tuple(checks), count, tuple(notes))
+    return fitted, checks, count
 
 
 MOVES = 4
@@ -127,19 +116,18 @@ class BenchProblem:
 
     def __init__(self, survey: Survey, options: BenchOptions) -> None:
         self.survey, self.options = survey, options
-        terms = bench_terms(survey)
-        wrong, _ = wrong_dots(terms.checks)
-        checks = tuple(t.only(~wrong[t.name]) if t.name in wrong else t for t in terms.checks)
-        self.terms = replace(terms, checks=checks)
-        self.notes = list(self.terms.notes)
+        self.notes = list[str]()
+        self.images, checks, self.attitudes = bench_terms(survey, self.notes)
+        wrong, _ = wrong_dots(checks)
+        self.checks = [t.only(~wrong[t.name]) if t.name in wrong else t for t in checks]
         self.joint_rad = survey.sigma.joint_rad
-        if not any(t.attitude is not None for t in self.terms.images):
+        if not any(t.attitude is not None for t in self.images):
             raise BenchNotFitted(
                 "no picture of a head camera shows a board: the head cannot be calibrated; at least 20 "
                 "pictures are expected, with pan and tilt both moved between them"
             )
-        self.cameras = {t.camera: survey.cameras[t.camera] for t in self.terms.images}
-        self.boards = tuple(dict.fromkeys(t.board[0] for t in self.terms.images))
+        self.cameras = {t.camera: survey.cameras[t.camera] for t in self.images}
+        self.boards = tuple(dict.fromkeys(t.board[0] for t in self.images))
         self.split: list[tuple[tuple[str, str], tuple[str, str], str]] = []
         self.views = self._views()
         self.begin()
@@ -157,18 +145,17 @@ class BenchProblem:
             self._moved_far(board, elsewhere)
             start = self._start()
         self.notes += start.notes
-        images = [t for t in self.terms.images if t.board in start.estimate.rover_from_board]
-        checks = [t for t in self.terms.checks if t.board in start.estimate.rover_from_board]
-        self.terms = replace(self.terms, images=tuple(images), checks=tuple(checks))
+        self.images = [t for t in self.images if t.board in start.estimate.rover_from_board]
+        self.checks = [t for t in self.checks if t.board in start.estimate.rover_from_board]
         self.start, self.doubtful = self._in_rover(start.estimate), start.doubtful
-        self.boards = tuple(dict.fromkeys(t.board[0] for t in images))
+        self.boards = tuple(dict.fromkeys(t.board[0] for t in self.images))
 
     def _start(self) -> BenchStart:
-        return bench_start(self.terms.images, self.views, self.terms.attitudes if self.joint_rad > 0 else 0)
+        return bench_start(self.images, self.views, self.attitudes if self.joint_rad > 0 else 0)
 
     def _moved_far(self, board: tuple[str, str], elsewhere: frozenset[str]) -> None:
         """Split the placement of a board that moved; refuse one that stood at two places in turn."""
-        shown = [t for t in self.terms.images if t.board == board]
+        shown = [t for t in self.images if t.board == board]
         there = np.array([t.name in elsewhere for t in shown])
         changes = np.flatnonzero(there[1:] != there[:-1])
         # A picture that says nothing clear may lie on either side: the change is where it divides best.
@@ -181,29 +168,26 @@ class BenchProblem:
                 "moved and put back. Leave one board only, or print the other with other ids (first_id)"
             )
         before, after = shown[cut - 1].name, shown[cut].name
-        self.notes.append(
-            f"board {board[0]} moved during placement {board[1]}, between pictures {before} and {after}; "
-            "from there on it counts as another placement"
-        )
-        self.split_placement(board, after)
+        moved = f"board {board[0]} moved during placement {board[1]}, between pictures {before} and {after}"
+        self.split_placement(board, after, moved)
 
-    def split_placement(self, board: tuple[str, str], after: str) -> None:
+    def split_placement(self, board: tuple[str, str], after: str, why: str) -> None:
         """Give the images of a board from one on a placement of their own."""
+        self.notes.append(f"{why}; from there on it counts as another placement")
         moved = (board[0], f"{board[1]} from {after} on")
         self.split.append((board, moved, after))
         names = [i.name for i in self.survey.images]
         later = set(names[names.index(after) :])
-        images, checks = (
-            tuple(replace(t, board=moved) if t.board == board and t.name in later else t for t in terms)
-            for terms in (self.terms.images, self.terms.checks)
+        self.images, self.checks = (
+            [replace(t, board=moved) if t.board == board and t.name in later else t for t in terms]
+            for terms in (self.images, self.checks)
         )
-        self.terms = replace(self.terms, images=images, checks=checks)
 
     def _views(self) -> dict[str, ViewPoses]:
         """What each camera says by itself."""
         views = {}
         for name, camera in self.cameras.items():
-            mine = [t for t in self.terms.images if t.camera == name]
+            mine = [t for t in self.images if t.camera == name]
             try:
                 views[name] = view_poses(
                     mine, self.options.kind or camera.kind, camera.size_px, camera.focal_px or None
@@ -241,7 +225,7 @@ class BenchProblem:
         """The least-squares problem with some terms."""
         known = self.options.rover_from_board
         return Adjustment(
-            with_kept(self.terms.images, self.doubtful),
+            with_kept(self.images, self.doubtful),
             (),
             state,
             mast_parameters=[*(() if known is None else range(6)), *term_numbers(chosen, "mast")],
@@ -255,7 +239,7 @@ class BenchProblem:
     def candidates(self) -> dict[str, ModelTerm]:
         """Terms that pictures could determine: backlash only where the axis came from both sides."""
         found = {}
-        approaches = np.array([t.approach for t in self.terms.images if t.attitude is not None])
+        approaches = np.array([t.approach for t in self.images if t.attitude is not None])
         for name, term in candidate_terms(self.boards).items():
             if term.kind == "backlash":
                 sides = set(approaches[:, ("pan", "tilt").index(term.of)].tolist())

@@ -14,7 +14,7 @@ from hil_tests.support.sim_survey.bench import BenchCamera, BenchPlan, simulate_
 def test_the_model_that_made_the_pictures_earns_its_parameters() -> None:
     camera = BenchCamera()
     plan = BenchPlan(attitudes=5, cameras={"navcam_left": camera})
-    terms = bench_terms(simulate_bench(2, plan)).images
+    terms = bench_terms(simulate_bench(2, plan), [])[0]
     scores = compare_families(terms, camera.size_px, camera.focal_px[0], ("CAHV", "CAHVOR"))
     assert earned(scores, "CAHV").kind == "CAHVOR", [(one.kind, one.left_out_px) for one in scores]
     assert scores[1].left_out_px == pytest.approx(0.1, rel=0.15)

@@ -160,7 +160,7 @@ def test_pictures_that_the_start_doubts_come_back(monkeypatch: pytest.MonkeyPatc
 
     def doubting(bench: BenchProblem) -> None:
         begin(bench)
-        bench.doubtful |= {t.name for t in bench.terms.images if t.attitude in (1, 4, 6, 9, 13)}
+        bench.doubtful |= {t.name for t in bench.images if t.attitude in (1, 4, 6, 9, 13)}
 
     begin = BenchProblem.begin
     monkeypatch.setattr(BenchProblem, "begin", doubting)
