@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -304,55 +304,44 @@ class Adjustment:
             [*(t for t in self.images if t.keep.any()), *(p for p in self.station if p.keep)]
         )
 
-    def _of_images(self, images: Sequence[ImageTerm]) -> list[ImageStack]:
-        """Stacks of images with the same camera and kinds of unknowns."""
-        groups: dict[tuple[object, ...], list[ImageTerm]] = {}
-        for term in images:
-            kind = (
-                term.camera, term.attitude is None, self._own_reading(term),
-                term.board[0] in self.bowed, term.board in self.fixed,
-            )  # fmt: skip
-            groups.setdefault(kind, []).append(term)
-        return [ImageStack.of(mine, self.unknowns, self._image_keys) for mine in groups.values()]
+    def _stacked(self, terms: Iterable[ImageTerm | StationTerm]) -> list[AnyStack]:
+        """Stacks of terms of one camera, or of the station, with unknowns of the same kinds."""
+        groups: dict[tuple[object, ...], tuple[list[Any], list[tuple[Key, ...]]]] = {}
+        for term in terms:
+            image, keys = isinstance(term, ImageTerm), tuple(self._keys(term))
+            kind = (image, keys[0] if image else (), *(key[0] for key in keys))
+            mine = groups.setdefault(kind, ([], []))
+            mine[0].append(term)
+            mine[1].append(keys)
+        return [
+            (ImageStack if image else StationStack).of(*mine, self.unknowns)
+            for (image, *_), mine in groups.items()
+        ]
 
-    def _image_keys(self, image: ImageTerm) -> Iterator[Key]:
-        """The unknowns that an image depends on: a camera's first, a bow's last, between them what moves the
-        board before the camera."""
-        yield "camera", image.camera
-        if image.attitude is not None:
+    def _keys(self, term: ImageTerm | StationTerm) -> Iterator[Key]:
+        """The unknowns that a term depends on: of an image its camera first, a bow last, between them what
+        moves the board before the camera."""
+        if isinstance(term, StationTerm):
+            yield "setup", term.setup
+            if term.board is not None:
+                yield "board", term.board
+            elif self.prism_cad_m > 0:
+                yield "prism", term.point
+            return
+        yield "camera", term.camera
+        if term.attitude is not None:
             yield MAST
             yield JOINT_ERRORS
-            if self._own_reading(image):
-                yield "attitude", image.attitude
-        if image.board not in self.fixed:
-            yield "board", image.board
-        if image.board[0] in self.bowed:
-            yield "bow", image.board[0]
+            if self._own_reading(term):
+                yield "attitude", term.attitude
+        if term.board not in self.fixed:
+            yield "board", term.board
+        if term.board[0] in self.bowed:
+            yield "bow", term.board[0]
 
     def _own_reading(self, image: ImageTerm) -> bool:
         """Whether the readings of an image are unknowns: they are fitted, and not exact."""
         return self.joint_rad > 0 and image.attitude is not None and image.attitude >= 0
-
-    def _stacked(self, terms: Iterable[ImageTerm | StationTerm]) -> list[AnyStack]:
-        """Stacks of images, of the station's prisms, and of its tapes."""
-        images, prisms, tapes = list[ImageTerm](), list[StationTerm](), list[StationTerm]()
-        for term in terms:
-            if isinstance(term, ImageTerm):
-                images.append(term)
-            else:
-                (prisms if term.board is None else tapes).append(term)
-        groups = [
-            StationStack.of(mine, self.unknowns, self._station_keys) for mine in (prisms, tapes) if mine
-        ]
-        return [*self._of_images(images), *groups]
-
-    def _station_keys(self, point: StationTerm) -> Iterator[Key]:
-        """The unknowns that a point of the station depends on."""
-        yield "setup", point.setup
-        if point.board is not None:
-            yield "board", point.board
-        elif self.prism_cad_m > 0:
-            yield "prism", point.point
 
     def readings(self, state: Estimate, images: Sequence[ImageTerm]) -> tuple[FloatArray, FloatArray]:
         """What pan and tilt read (2, k) at head images, without noise, and from which side they came."""

@@ -7,7 +7,7 @@ operation together, and only their normal equations are summed one by one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Self
@@ -30,11 +30,10 @@ class _Stack:
     sizes: tuple[int, ...]
 
     @classmethod
-    def of(cls, terms: Sequence[Any], unknowns: Unknowns, keys_of: Callable[[Any], Iterable[Key]]) -> Self:
+    def of(cls, terms: Sequence[Any], keys: Sequence[tuple[Key, ...]], unknowns: Unknowns) -> Self:
         """Return terms with unknowns of the same kinds in a row."""
-        keys = tuple(tuple(keys_of(term)) for term in terms)
         columns = tuple(np.concatenate([unknowns.at(key) for key in mine]) for mine in keys)
-        return cls(tuple(terms), keys, columns, tuple(len(unknowns.at(key)) for key in keys[0]))
+        return cls(tuple(terms), tuple(keys), columns, tuple(len(unknowns.at(key)) for key in keys[0]))
 
     @property
     def counts(self) -> Sequence[int]:
