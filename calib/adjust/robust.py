@@ -96,7 +96,7 @@ class Weighed:
 
 def weighed_fields(
     survey: Survey,
-    stated: tuple[Adjustment, Minimum[Estimate]],
+    cleaned: Cleaned,
     weighed: Weighed,
     images: Sequence[ImageTerm],
     checks: Sequence[ImageTerm],
@@ -107,7 +107,7 @@ def weighed_fields(
 ) -> dict[str, Any]:
     """Return the fields of a `FittedRig` that follow from a weighed fit.
 
-    Chi-square is that of the fit by the ``stated`` sigmas. ``images`` are all with every dot, and ``checks``
+    Chi-square is that of the fit by the stated sigmas. ``images`` are all with every dot, and ``checks``
     the check images, with stated sigmas; the rest is as of `calib.adjust.uncertainty.fitted_fields`.
     """
     problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
@@ -116,8 +116,8 @@ def weighed_fields(
     sized = widened_images(scattered_images(checks, own), weighed.factors)
     scatter = {t.name: t.scatter for t in (*weighed.images, *sized)}
     residuals = image_residuals(survey, problem, state, images, checks, scatter)
-    by_stated = covariance_of(stated[1].normal.matrix, stated[0].weak)
-    chi2, freedom = goodness(stated[0], stated[1].state, by_stated)
+    stated, fit = cleaned.as_stated()
+    chi2, freedom = goodness(stated, fit.state, covariance_of(fit.normal.matrix, stated.weak))
     return {
         **fitted_fields(survey, problem, state, covariance, residuals, sized, kinds, level, notes, widened),
         "chi2": chi2,

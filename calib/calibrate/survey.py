@@ -14,7 +14,7 @@ from scipy.special import chdtrc
 
 from calib.adjust.adjustment import HUBER, SCAN_HUBER, Adjustment
 from calib.adjust.goodness import goodness
-from calib.adjust.gross import GROSS, chance_limit
+from calib.adjust.gross import GROSS
 from calib.adjust.hypotheses import (
     Finding,
     ScoredFit,
@@ -140,11 +140,9 @@ def _calibration(
             f"(chi-square {chi_square:.0f} for {freedom:.0f}); uncertainties are scaled up by as much"
         )
         widened = chi_square / freedom
-    stated = cleaned.as_stated()
-    notes += _prism_notes(stated[0], stated[1].state, mast_parameters)
-    kinds = ("mast", "camera")
+    kinds, checks = ("mast", "camera"), start.checks
     fields = weighed_fields(
-        survey, stated, weighed, start.images, start.checks, kinds, Level.STATED, notes, widened
+        survey, cleaned, weighed, start.images, checks, kinds, Level.STATED, notes, widened
     )
     of_checks = tuple(f"image {t.name} dot " for t in start.checks)
     fields["outliers"] += tuple(o for o in start.wrong if o.name.startswith(of_checks))
@@ -166,18 +164,3 @@ def _wider(cleaned: Cleaned, weighed: Weighed) -> tuple[Finding, ...]:
     causes = explaining(survey_findings(ScoredFit(cleaned.problem, cleaned.fit.state)), weighed.excess)
     named = {finding.name for finding in causes}
     return (*causes, *(finding for finding in found if finding.name not in named))
-
-
-def _prism_notes(problem: Adjustment, state: Estimate, mast_parameters: int) -> list[str]:
-    """Sentences on set-ups whose prisms do not fit the rover, though each may be the wrong one."""
-    notes = []
-    for setup in state.rover_from_station:
-        prisms = [p for p in problem.station if p.setup == setup and p.board is None and p.keep]
-        residuals = np.array(problem.residuals(state, prisms))
-        if float(np.sum(residuals**2)) > chance_limit(Level.STATED, 1, 3 * len(prisms)):
-            worst = 1000 * float(np.linalg.norm(residuals, axis=1).max()) * prisms[0].sigma_m
-            why = "an upright mast" if mast_parameters == 4 else "their CAD positions"
-            notes.append(
-                f"the prisms of set-up {setup} do not agree with {why}: they are off by up to {worst:.1f} mm"
-            )
-    return notes

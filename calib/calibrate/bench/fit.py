@@ -206,7 +206,7 @@ def _calibration(
     kinds = ("mast", "joints", "camera")
     images, checks = bench.images, bench.checks
     fields = weighed_fields(
-        bench.survey, cleaned.as_stated(), weighed, images, checks, kinds, Level.PREDICTED, bench.notes
+        bench.survey, cleaned, weighed, images, checks, kinds, Level.PREDICTED, bench.notes
     )
     beside = choose_terms(problem, weighed.fit, chosen)[1]  # those of the model beside one another
     beside = {name: replace(gain, entered=True) for name, gain in beside.items()}
