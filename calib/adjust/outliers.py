@@ -22,6 +22,7 @@ say what is.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -52,11 +53,12 @@ class Outlier:
         false alarms, wider where the typical measurement is farther off than its sigma says. Not-a-number
         for an image that was left out with its board's tapes.
     size
-        How far off it is: pixels (rms over an image) or metres. Not-a-number for an image whose board,
-        as it is named, the camera cannot see.
+        How far off it is: pixels (rms over an image, in the worst camera of a hand-off, across the epipolar
+        line of its clicks) or metres. Not-a-number for an image whose board, as it is named, the camera
+        cannot see.
     """
 
-    kind: Literal["dot", "image", "tape", "prism"]
+    kind: Literal["dot", "image", "tape", "prism", "hand-off", "clicks"]
     name: str
     statistic: float
     limit: float
@@ -67,6 +69,13 @@ class Outlier:
         """The outlier for a person."""
         if not np.isfinite(self.size):
             return f"{self.name} cannot show the board that it names and was not used"
+        if self.kind == "clicks":
+            return (
+                f"{self.name} was not used: its two clicks do not mean one point, they are {self.size:.1f} "
+                f"px apart across the epipolar line, {math.sqrt(self.statistic):.1f} sigma"
+            )
+        if self.kind == "hand-off":
+            return f"{self.name} is off by {self.size:.1f} px after the correction and was not used"
         off = f"{self.size:.2f} px" if self.kind in ("dot", "image") else f"{1000 * self.size:.1f} mm"
         return f"{self.name} is off by {off} and was not used"
 

@@ -13,7 +13,6 @@ which they were corrected by.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -21,6 +20,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from calib.adjust.gross import bounded, worst_first
+from calib.adjust.outliers import Outlier
 from calib.calibrate.body_sights import BodySights, Equations, body_sights
 from calib.errors import NoCorrection
 from calib.geometry.covariance import MOST_SIGMAS, RigCovariance, click_rates, pixel_rates
@@ -48,31 +48,6 @@ SPREAD = 0.2
 """Of the picture's width, that found pixels must span at least."""
 
 MOST_OUTLIERS = 1 / 3
-
-
-@dataclass(frozen=True, eq=False)
-class LeftOutHandoff:
-    """A hand-off that was not used, and the test it failed.
-
-    It contradicts the rest, by ``off_px`` in the worst camera; or, if it is not ``one_point``, its clicks
-    contradict each other, by ``off_px`` across the epipolar line.
-    """
-
-    name: str
-    off_px: float
-    statistic: float
-    limit: float
-    one_point: bool = True
-
-    @property
-    def sentence(self) -> str:
-        """The outlier for a person."""
-        if not self.one_point:
-            return (
-                f"{self.name} was not used: its two clicks do not mean one point, they are "
-                f"{self.off_px:.1f} px apart across the epipolar line, {math.sqrt(self.statistic):.1f} sigma"
-            )
-        return f"{self.name} is off by {self.off_px:.1f} px after the correction and was not used"
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +95,7 @@ class BodyPose:
     gain: FloatArray
     motion: Rigid
     used: BodySights
-    outliers: tuple[LeftOutHandoff, ...]
+    outliers: tuple[Outlier, ...]
     rms_px: dict[str, tuple[tuple[float, float], tuple[float, float]]]
     chi2_before: float
     chi2_after: float
@@ -171,13 +146,14 @@ def fit_body_pose(rig: Rig, cameras: Sequence[str], handoffs: Sequence[MatchedHa
             "fix it",
         )
     left_out = [
-        LeftOutHandoff(one.name, gap.across_px, gap.sigmas**2, MOST_SIGMAS**2, one_point=False)
-        for one, gap in every.apart
+        Outlier("clicks", one.name, gap.sigmas**2, MOST_SIGMAS**2, gap.across_px) for one, gap in every.apart
     ]
     at = every.equations(fit.step)
     for i in np.flatnonzero(~keep):
         off = float(np.linalg.norm(at.residual_px[i].reshape(-1, 2), axis=1).max())
-        left_out.append(LeftOutHandoff(every.handoffs[i].name, off, float(statistics[i]), float(limits[i])))
+        left_out.append(
+            Outlier("hand-off", every.handoffs[i].name, float(statistics[i]), float(limits[i]), off)
+        )
     return _correction(used, fit, tuple(left_out))
 
 
@@ -291,7 +267,7 @@ def _keep(sights: BodySights) -> tuple[np.ndarray, FloatArray, FloatArray]:
     return worst_first(keep, ratios, MOST_OUTLIERS), statistics, limits
 
 
-def _correction(used: BodySights, fit: _BodyFit, outliers: tuple[LeftOutHandoff, ...]) -> BodyPose:
+def _correction(used: BodySights, fit: _BodyFit, outliers: tuple[Outlier, ...]) -> BodyPose:
     """Significance, open directions, and what becomes of the residuals."""
     information, gradient, statistics = _normal(fit.before, np.ones(len(used.handoffs)))
     # In units of the prior's sigma: what the hand-offs say of each direction, against 1 that the prior says.
