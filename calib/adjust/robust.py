@@ -134,6 +134,11 @@ def weigh(cleaned: Cleaned, *, narrows: bool = True) -> Weighed:
     """Return the fit with the sigma of each kind of measurement that is worse, or better, than stated.
 
     ``narrows`` says whether a sigma may become smaller than stated.
+
+    Raises
+    ------
+    SurveyNotFitted
+        If the last fit did not settle.
     """
     problem, fit, images = cleaned.problem, cleaned.fit, cleaned.images
     weighed = dict(cleaned.cameras)
@@ -149,6 +154,11 @@ def weigh(cleaned: Cleaned, *, narrows: bool = True) -> Weighed:
         weighed |= wanted
         images = widened_images(images, change)
         problem, fit = judged(problem.with_sigmas(change), fit.state, images)
+    if not fit.settled:
+        raise SurveyNotFitted(
+            f"the fit did not settle: after {fit.steps} steps it was still finding better values, so that "
+            "neither they nor their sigmas are good. Take more images, at more joint angles and distances"
+        )
     wrong = {c.kind for c in components if c.wrong}
     excess = sum(((c.factor / c.weighed) ** 2 - 1) * c.redundancy for c in first if c.kind in wrong)
     return Weighed(problem, fit, covariance, tuple(images), components, excess)

@@ -1,11 +1,10 @@
-"""What a fit may not end as: far from the noise, without most images of a camera, or still on its way."""
+"""What a fit may not end as: far from the noise, or without most images of a camera."""
 
 from __future__ import annotations
 
 from calib.adjust.adjustment import Adjustment
 from calib.adjust.robust import SurveyNotFitted, typical_length
 from calib.adjust.scatter import typical_excess
-from calib.adjust.solver import Minimum
 from calib.adjust.unknowns import Estimate
 
 FAR_SCATTER = 1.5
@@ -57,12 +56,3 @@ def refuse_far(
                 f"px), and {dot}s of an image are off together, not one by one: it ended in a wrong minimum, "
                 f"the lens is not of this model, or {coherent}"
             )
-
-
-def refuse_unsettled(fit: Minimum[Estimate], more: str) -> None:
-    """Raise if a fit did not settle; ``more`` says what images to take."""
-    if not fit.settled:
-        raise SurveyNotFitted(
-            f"the fit did not settle: after {fit.steps} steps it was still finding better values, so that "
-            f"neither they nor their sigmas are good. Take more images, at more {more}"
-        )

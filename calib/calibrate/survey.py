@@ -27,7 +27,7 @@ from calib.adjust.robust import Cleaned, SurveyNotFitted, Weighed, weigh, weighe
 from calib.adjust.solver import minimise
 from calib.adjust.uncertainty import station_fields
 from calib.adjust.unknowns import Estimate
-from calib.calibrate.refusals import refuse_far, refuse_unsettled
+from calib.calibrate.refusals import refuse_far
 from calib.calibrate.starts.survey import Start, start_values
 from calib.geometry.significance import Level
 from calib.survey.records import Survey
@@ -61,10 +61,7 @@ def fit_joint(survey: Survey, mast_parameters: int = 6) -> Calibration:
     cleaned = without_blunders(problem, start.estimate, start.images, survey.sigma.dot_px)
     change = _what_changed(cleaned)
     _refuse_wrong_minimum(cleaned.problem, cleaned.fit.state, survey.sigma.dot_px, change)
-    refuse_unsettled(cleaned.fit, "joint angles and distances")
-    weighed = weigh(cleaned)
-    refuse_unsettled(weighed.fit, "joint angles and distances")
-    return _calibration(survey, mast_parameters, start, cleaned, weighed, change, began)
+    return _calibration(survey, mast_parameters, start, cleaned, weigh(cleaned), change, began)
 
 
 def _what_changed(cleaned: Cleaned) -> Finding | None:

@@ -35,7 +35,7 @@ from calib.adjust.solver import minimise
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.bench.problem import MOVES, BenchOptions, BenchProblem, best_cut, without_terms
-from calib.calibrate.refusals import refuse_far, refuse_unsettled
+from calib.calibrate.refusals import refuse_far
 from calib.calibrate.starts.bench import BenchNotFitted, SomethingChanged
 from calib.calibrate.starts.wrong_dots import without_wrong
 from calib.geometry.significance import Level
@@ -84,7 +84,6 @@ def _fitted(bench: BenchProblem, began: float) -> BenchCalibration:
     _refuse_far(bench, cleaned.problem, cleaned.fit.state)
     # counts and the least of corners are known; what a simulated or lucky bench has less is no knowledge
     weighed = weigh(cleaned, narrows=False)
-    refuse_unsettled(weighed.fit, "pan and tilt angles and distances")
     return _calibration(bench, cleaned, weighed, chosen, tests, began)
 
 
