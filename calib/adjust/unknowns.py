@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.rig import JOINTS_NAMES, JointErrors, Mast, joints_of, mast_of
+from calib.geometry.rig import JOINTS_NAMES, MAST_NAMES, JointErrors, Mast, joints_of, mast_of
 from calib.geometry.rigid import FloatArray, Rigid
 
 Key = tuple[Hashable, ...]
@@ -130,12 +130,12 @@ class Estimate:
     ``calib.geometry.rig.JOINTS_NAMES``, ``bows_m`` by board (2,) how far the middles of its sides, right and
     left, top and bottom, lie behind its centre, metres."""
 
-    cameras: Mapping[str, CameraModel]
-    mast: FloatArray
-    rover_from_station: Mapping[str, Rigid]
-    rover_from_board: Mapping[tuple[str, str], Rigid]
-    prisms_in_rover_m: Mapping[str, FloatArray]
-    joints_rad: FloatArray
+    cameras: Mapping[str, CameraModel] = field(default_factory=dict)
+    mast: FloatArray = field(default_factory=lambda: np.zeros(len(MAST_NAMES)))
+    rover_from_station: Mapping[str, Rigid] = field(default_factory=dict)
+    rover_from_board: Mapping[tuple[str, str], Rigid] = field(default_factory=dict)
+    prisms_in_rover_m: Mapping[str, FloatArray] = field(default_factory=dict)
+    joints_rad: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     joint_errors: FloatArray = field(default_factory=lambda: np.zeros(len(JOINTS_NAMES)))
     bows_m: Mapping[str, FloatArray] = field(default_factory=dict)
 

@@ -165,7 +165,7 @@ def boards_problem(views: BoardViews, focal_px: float) -> tuple[Adjustment, Esti
                 views.in_board_m, pixels, np.full(len(pixels), NOISE_PX), np.ones(len(pixels), dtype=bool),
             )
         )  # fmt: skip
-    start = Estimate({"camera": camera}, np.zeros(8), {}, poses, {}, np.zeros((0, 2)))
+    start = Estimate({"camera": camera}, rover_from_board=poses)
     return Adjustment(terms, (), start, mast_parameters=0, prisms_cad_m={}), start
 
 
@@ -180,7 +180,7 @@ def fit_ours(kind: Kind, size_px: tuple[int, int], terms: Sequence[ImageTerm]) -
     found = view_poses(terms, kind, size_px, None)
     terms = [term for term in terms if term.name in found.poses]
     boards = {term.board: found.poses[term.name][0] for term in terms}
-    start = Estimate({"camera": found.model}, np.zeros(8), {}, boards, {}, np.zeros((0, 2)))
+    start = Estimate({"camera": found.model}, rover_from_board=boards)
     problem = Adjustment(terms, (), start, mast_parameters=0)
     fit = minimise(problem, start, weak=problem.weak)
     left = boards_residuals(problem, fit.state)

@@ -26,7 +26,6 @@ from calib.adjust.uncertainty import SEEN_RAD
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.views import ViewPoses
 from calib.errors import CalibError
-from calib.geometry.rig import MAST_NAMES
 from calib.geometry.rigid import FloatArray, Rigid, rot_y, rot_z
 
 ROUNDS = 12
@@ -120,7 +119,7 @@ def bench_start(images: Sequence[ImageTerm], views: Mapping[str, ViewPoses], att
     for board in sorted(lonely):
         notes.append(f"placement {board[1]} of board {board[0]} is not used: no head camera shows it well")
     estimate = Estimate(
-        {n: cameras[n] for n in views}, np.zeros(len(MAST_NAMES)), {}, boards, {}, np.zeros((attitudes, 2))
+        {n: cameras[n] for n in views}, rover_from_board=boards, joints_rad=np.zeros((attitudes, 2))
     )
     return BenchStart(
         estimate,

@@ -20,7 +20,6 @@ from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.agreeing import Agreed, best_agreeing, thinned
 from calib.calibrate.starts.views import centred_camera, poses_of
 from calib.geometry.cahvor import CameraModel, Kind
-from calib.geometry.rig import MAST_NAMES
 from calib.geometry.rigid import Rigid
 
 FOCAL_FACTORS = (1.0, 0.85, 1.18)
@@ -59,7 +58,7 @@ def fit_camera(
     still = [replace(t, attitude=None) for t in images]
 
     def start(model: CameraModel) -> tuple[Adjustment, Estimate]:
-        state = Estimate({name: model}, np.zeros(len(MAST_NAMES)), {}, boards, {}, np.zeros((0, 2)))
+        state = Estimate({name: model}, rover_from_board=boards)
         return Adjustment(still, (), state, mast_parameters=0, fixed=tuple(boards)), state
 
     best = best_agreeing(map(start, _starts(still, boards, kind, size_px, focal_px)), expected_px)

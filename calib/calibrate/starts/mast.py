@@ -111,7 +111,7 @@ def fit_mast(
         )
 
     def start(mast: FloatArray) -> tuple[Adjustment, Estimate]:
-        state = Estimate(references.in_head(mast), mast, {}, boards, {}, np.zeros((0, 2)))
+        state = Estimate(references.in_head(mast), mast, rover_from_board=boards)
         problem = MastAlone(images, (), state, mast_parameters=mast_parameters, fixed=tuple(boards))
         problem.references = references
         return problem, state

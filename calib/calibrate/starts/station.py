@@ -22,7 +22,6 @@ from calib.adjust.robust import judged
 from calib.adjust.solver import covariance_of
 from calib.adjust.terms import station_terms
 from calib.adjust.unknowns import Estimate
-from calib.geometry.rig import MAST_NAMES
 from calib.geometry.rigid import FloatArray, Rigid
 from calib.geometry.significance import Level
 from calib.survey.alignment import Alignment, NotAligned, rover_from_station, station_from_board
@@ -100,12 +99,8 @@ def _together(
         for term in station_terms(survey, {})
     ]
     start = Estimate(
-        {},
-        np.zeros(len(MAST_NAMES)),
-        {setup: pose.b_from_a for setup, pose in alone.items()},
-        {},
-        survey.prisms_in_rover_m,
-        np.zeros((0, 2)),
+        rover_from_station={setup: pose.b_from_a for setup, pose in alone.items()},
+        prisms_in_rover_m=survey.prisms_in_rover_m,
     )
     problem = Adjustment(
         (),

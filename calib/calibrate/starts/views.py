@@ -122,7 +122,7 @@ def _free_boards(images: Sequence[ImageTerm], start: CameraModel) -> tuple[Adjus
     placed = [(t, poses[0][1]) for t in images if (poses := poses_of(start, t))]
     terms = [replace(t, board=(t.name, ""), attitude=None) for t, _ in placed]
     boards = {(t.name, ""): pose for t, pose in placed}
-    state = Estimate({images[0].camera: start}, np.zeros(8), {}, boards, {}, np.zeros((0, 2)))
+    state = Estimate({images[0].camera: start}, rover_from_board=boards)
     return Adjustment(terms, (), state, mast_parameters=0), state
 
 
