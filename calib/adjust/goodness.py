@@ -75,49 +75,38 @@ def variance_components(
     blocks' normal equations. ``weighed`` is by what the stated sigma of a kind was multiplied before:
     residuals are in sigmas of that size.
     """
-    before = weighed or {}
-    size = len(covariance)
-    squares: dict[str, float] = {}
-    counts: dict[str, int] = {}
-    normals: dict[str, FloatArray] = {}
-    for what, block in blocks:
-        kind = what.kind
-        if kind is None:
-            continue
-        matrix = normals.setdefault(kind, np.zeros((size, size)))
-        matrix[np.ix_(block.columns, block.columns)] += block.jacobian.T @ block.jacobian
-        squares[kind] = squares.get(kind, 0.0) + float(block.residual @ block.residual)
-        counts[kind] = counts.get(kind, 0) + len(block.residual)
-    kinds = list(normals)
-    taken = [covariance @ normals[kind] for kind in kinds]
+    before, sums = weighed or {}, _by_kind(blocks, len(covariance))
+    taken = [covariance @ normal for _, _, normal in sums.values()]
     helmert = np.array([[float(np.sum(one * other.T)) for other in taken] for one in taken])
     paid = np.array([np.trace(one) for one in taken])
-    count = np.array([counts[kind] for kind in kinds], dtype=np.float64)
-    helmert[np.diag_indices(len(kinds))] += count - 2 * paid
-    redundancy = count - paid
-    spread = 2 * np.diag(np.linalg.pinv(helmert)) if kinds else np.zeros(0)
+    counts = np.array([count for _, count, _ in sums.values()], dtype=np.float64)
+    helmert[np.diag_indices(len(sums))] += counts - 2 * paid
+    spread = 2 * np.diag(np.linalg.pinv(helmert)) if sums else np.zeros(0)
     found = []
-    for index, kind in enumerate(kinds):
-        times, r = before.get(kind, 1.0), float(redundancy[index])
+    for (kind, (squares, count, _)), r, variance in zip(sums.items(), counts - paid, spread, strict=True):
+        times = before.get(kind, 1.0)
         if r < FEWEST:
-            found.append(Component(kind, counts[kind], r, float("nan"), float("nan"), times, 1.0))
+            found.append(Component(kind, count, float(r), float("nan"), float("nan"), times, 1.0))
             continue
-        factor = float(np.sqrt(squares[kind] / r)) * times
-        sigma = factor * float(np.sqrt(spread[index])) / 2
-        square = squares[kind] * times**2
-        found.append(
-            Component(
-                kind,
-                counts[kind],
-                r,
-                factor,
-                sigma,
-                times,
-                float(chdtrc(r, square)),
-                float(chdtr(r, square)),
-            )
-        )
+        factor = float(np.sqrt(squares / r)) * times
+        sigma = factor * float(np.sqrt(variance)) / 2
+        large, small = (float(of(r, squares * times**2)) for of in (chdtrc, chdtr))
+        found.append(Component(kind, count, float(r), factor, sigma, times, large, small))
     return tuple(found)
+
+
+def _by_kind(
+    blocks: Iterable[tuple[ImageTerm | StationTerm | Known, ResidualBlock]], size: int
+) -> dict[str, tuple[float, int, FloatArray]]:
+    """By kind of measurement the sum of squares, how many numbers there are, and JᵀJ of all unknowns."""
+    sums: dict[str, tuple[float, int, FloatArray]] = {}
+    for what, block in blocks:
+        if what.kind is not None:
+            squares, count, normal = sums.get(what.kind, (0.0, 0, np.zeros((size, size))))
+            normal[np.ix_(block.columns, block.columns)] += block.jacobian.T @ block.jacobian
+            squares += float(block.residual @ block.residual)
+            sums[what.kind] = squares, count + len(block.residual), normal
+    return sums
 
 
 def found_sigmas(components: Sequence[Component], *, narrows: bool = True) -> dict[str, float]:
@@ -154,12 +143,6 @@ def goodness(problem: Adjustment, state: Estimate, covariance: FloatArray) -> tu
     What is known of lenses beforehand counts as information but not as a measurement: the unknowns cost
     only as many degrees of freedom as the measurements have paid for, tr(JᵀJ C).
     """
-    total, count, paid = 0.0, 0, 0.0
-    for what, block in problem.blocks(state):
-        if what.kind is None:
-            continue
-        total += float(block.residual @ block.residual)
-        count += len(block.residual)
-        mine = covariance[np.ix_(block.columns, block.columns)]
-        paid += float(np.einsum("ik,kl,il->", block.jacobian, mine, block.jacobian))
-    return total, count - paid
+    sums = _by_kind(problem.blocks(state), len(covariance)).values()
+    freedom = sum(count - float(np.sum(covariance * normal)) for _, count, normal in sums)
+    return float(sum(squares for squares, _, _ in sums)), float(freedom)
