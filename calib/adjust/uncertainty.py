@@ -250,15 +250,13 @@ def pointing_covariance(
     tilt_rad: float,
     left_px: FloatArray,
     range_m: float,
-    *,
-    click_px: float = 0.0,
 ) -> FloatArray:
-    """Return the covariance (2, 2), px², of where a target lands that was clicked in a stereo pair.
+    """Return the covariance (2, 2), px², of where a target lands that was clicked in a stereo pair, from the
+    calibration alone.
 
     The target is ``range_m`` along the ray of ``left_px`` in the left image at the given joint angles. It is
     found by stereo with the calibrated rig, and the head is pointed so that it should land in the middle of
-    the left image (`calib.geometry.landing`). ``click_px`` is the sigma of a click coordinate in both images;
-    0 leaves the calibration alone.
+    the left image (`calib.geometry.landing`).
 
     Raises
     ------
@@ -268,9 +266,8 @@ def pointing_covariance(
     rig = calibration.rig
     rays = rig.camera_in_rover(pair[0], pan_rad, tilt_rad).ray(left_px)
     target = rays.origins_m + range_m * rays.directions
-    rates = landing_rates(rig, calibration.parameter_names, pair, pan_rad, tilt_rad, target)
-    by_rig, by_clicks = rates.to_rig, click_px * rates.to_clicks
-    return np.asarray(by_rig @ calibration.covariance @ by_rig.T + by_clicks @ by_clicks.T)
+    by_rig = landing_rates(rig, calibration.parameter_names, pair, pan_rad, tilt_rad, target).to_rig
+    return np.asarray(by_rig @ calibration.covariance @ by_rig.T)
 
 
 def open_parameters(
