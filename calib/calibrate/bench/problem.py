@@ -12,7 +12,7 @@ from calib.adjust.adjustment import HUBER, Adjustment
 from calib.adjust.model_terms import ModelTerm, candidate_terms, term_numbers
 from calib.adjust.terms import ImageTerm, with_kept
 from calib.adjust.unknowns import Estimate
-from calib.calibrate.starts.bench import BenchNotFitted, BenchStart, SomethingChanged, bench_start
+from calib.calibrate.starts.bench import BenchNotFitted, SomethingChanged, bench_start
 from calib.calibrate.starts.views import ViewPoses, ViewsTooFew, view_poses
 from calib.calibrate.starts.wrong_dots import wrong_dots
 from calib.geometry.cahvor import Kind
@@ -137,21 +137,17 @@ class BenchProblem:
 
         A board that stood elsewhere in all pictures from some one on counts as two placements.
         """
-        start = self._start()
-        for _ in range(MOVES):
-            if not start.elsewhere:
+        attitudes = self.attitudes if self.joint_rad > 0 else 0
+        for left in range(MOVES, -1, -1):
+            start = bench_start(self.images, self.views, attitudes)
+            if not start.elsewhere or not left:
                 break
-            board, elsewhere = next(iter(start.elsewhere.items()))
-            self._moved_far(board, elsewhere)
-            start = self._start()
+            self._moved_far(*next(iter(start.elsewhere.items())))
         self.notes += start.notes
         self.images = [t for t in self.images if t.board in start.estimate.rover_from_board]
         self.checks = [t for t in self.checks if t.board in start.estimate.rover_from_board]
         self.start, self.doubtful = self._in_rover(start.estimate), start.doubtful
         self.boards = tuple(dict.fromkeys(t.board[0] for t in self.images))
-
-    def _start(self) -> BenchStart:
-        return bench_start(self.images, self.views, self.attitudes if self.joint_rad > 0 else 0)
 
     def _moved_far(self, board: tuple[str, str], elsewhere: frozenset[str]) -> None:
         """Split the placement of a board that moved; refuse one that stood at two places in turn."""
