@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from mastctl.client import Client, ClientError, Snapshot
 
 TURN_TIMEOUT_S = 90.0
 PATIENCE_S = 30.0
-"""How long a camera or a head that fails is waited for: a cable is put back, a driver opens it again."""
+"""How long to wait for a camera or head that fails: a cable is put back, a driver opens it again."""
 
 AGAIN_S = 1.0
 ADJUSTING_S = 1.0
@@ -43,32 +43,20 @@ LASTING = frozenset(
         "bad_token", "bad_url", "busy", "closing",
     }
 )  # fmt: skip
-"""What waiting does not mend: somebody has to do something."""
+"""What waiting does not mend: an operator has to act."""
 
 
 class DaemonEyes:
-    """Looks through a daemon; see `mastctl.bench.eyes.BenchEyes`.
-
-    Parameters
-    ----------
-    client
-        Of the daemon, which should hold the lease.
-    cameras
-        Which of its cameras take pictures.
-    board
-        What is looked for.
-    """
+    """Looks for a board through some cameras of a daemon, whose lease ``client`` should have; see
+    `mastctl.bench.eyes.BenchEyes`."""
 
     def __init__(self, client: Client, cameras: Sequence[str], board: AnyBoard) -> None:
         self._client, self._cameras, self._board = client, tuple(cameras), board
         self._pool = ThreadPoolExecutor(2, "bench-corners")
         status = client.status()
         rig = served_rig(parse_rig(client.mast_file(), "the daemon's mast file").rig, cameras)
-        held = {
-            name: replace(camera, sensor_mode=_sensor_mode(client, name))
-            for name, camera in rig.cameras.items()
-        }
-        rig = replace(rig, cameras=held)
+        modes = {name: _sensor_mode(client, name) for name in rig.cameras}
+        rig = replace(rig, cameras={n: replace(c, sensor_mode=modes[n]) for n, c in rig.cameras.items()})
         axes = status["axes"]
         limits = status["limits"]
         self._head = BenchHead(
@@ -93,15 +81,8 @@ class DaemonEyes:
     ) -> BenchLook:
         """See `mastctl.bench.eyes.BenchEyes`.
 
-        Raises
-        ------
-        Interrupted
-            If somebody else steers, a stop was pressed, the daemon is gone, or head or cameras fail for
-            longer than a cable takes to be put back.
-        NotThere
-            If the daemon does not turn there.
-        NoLight
-            If every camera that gives a picture has too little light there, or too much.
+        Raises BenchInterrupted if another client steers, a stop was pressed, the daemon is gone, or head or
+        cameras fail for longer than a cable takes to be put back.
         """
         begun = time.monotonic()
         while True:
@@ -116,19 +97,6 @@ class DaemonEyes:
                 if error.code in LASTING or waited_s > PATIENCE_S:
                     raise BenchInterrupted(self._reason(error)) from None
                 time.sleep(AGAIN_S)
-
-    def seconds_each(self) -> dict[str, float]:
-        """Return how long a picture and finding its corners take of each camera, seconds; the head rests.
-
-        Cameras that give no picture are left out.
-        """
-        took_s: dict[str, float] = {}
-        for camera in self._cameras:
-            begun = time.monotonic()
-            with suppress(ClientError):
-                self._seen(self._client.snapshot(camera))
-                took_s[camera] = time.monotonic() - begun
-        return took_s
 
     def _look(
         self, pan_rad: float, tilt_rad: float, approach: tuple[int, int], cameras: Collection[str] | None
@@ -185,14 +153,14 @@ class DaemonEyes:
     def _go(self, pan_rad: float, tilt_rad: float) -> None:
         """Have the daemon turn to readings, as its commanded angles are."""
         operation = self._client.turn(pan_rad, tilt_rad, TURN_TIMEOUT_S)
-        told: Mapping[str, Any] = operation.get("error") or {}
-        why = str(told.get("message", "the move failed"))
+        error: Mapping[str, Any] = operation.get("error") or {}
+        why = str(error.get("message", "the move failed"))
         if operation["state"] == "stopped":
             raise BenchInterrupted(
                 f"the head was stopped in the middle of a move: {why}{self._how_to_go_on()}"
             )
         if operation["state"] != "done":
-            raise ClientError(str(told.get("code", "failed")), why)
+            raise ClientError(str(error.get("code", "failed")), why)
 
     def _how_to_go_on(self) -> str:
         """What releases the head, as the end of a sentence; empty if no emergency stop is latched."""
@@ -202,7 +170,7 @@ class DaemonEyes:
         return ""
 
     def _reason(self, error: ClientError) -> str:
-        """What a daemon refused, as what a person has to do about it."""
+        """A daemon's refusal as what a person has to do about it."""
         detail = error.detail or {}
         if error.code == "leased":
             return f"another client steers the head: {error}"
@@ -231,19 +199,15 @@ class DaemonEyes:
 
 
 def _sensor_mode(client: Client, camera: str) -> SensorMode | None:
-    """Which pixels of its sensor a camera's pictures show, as the daemon tells it."""
-    told: Any = None
+    """Which pixels of its sensor a camera's images show, by the daemon."""
+    mode: Any = None
     with suppress(ClientError):  # a camera that does not answer now may do later
-        told = client.camera_settings(camera).get("sensor_mode")
-    if told is None:
+        mode = client.camera_settings(camera).get("sensor_mode")
+    if mode is None:
         return None
-    size: Any
-    crop: Any
-    sensor: Any
-    size, crop, sensor = (
-        None if told[key] is None else tuple(told[key]) for key in ("size_px", "crop_px", "sensor_px")
-    )
-    return SensorMode(size, crop, sensor, FLIPS[told["flip"]])
+    keys = "size_px", "crop_px", "sensor_px"
+    size, crop, sensor = (None if mode[key] is None else tuple(mode[key]) for key in keys)
+    return SensorMode(cast(Any, size), cast(Any, crop), cast(Any, sensor), FLIPS[mode["flip"]])
 
 
 def served_rig(rig: Rig, cameras: Sequence[str]) -> Rig:
@@ -268,8 +232,8 @@ def beside_goal(wanted: float, now: float, side: int, limits: tuple[float, float
 
 
 def _side(shot: Snapshot, name: str) -> int:
-    told = float(getattr(shot, name, 0.0))
-    return 1 if told > SIDE else -1 if told < -SIDE else 0
+    approach = float(getattr(shot, name, 0.0))
+    return 1 if approach > SIDE else -1 if approach < -SIDE else 0
 
 
 def _unlit(error: ClientError) -> bool:

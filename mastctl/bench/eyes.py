@@ -1,4 +1,4 @@
-"""What a bench needs of a head with cameras: to look somewhere, and to say what it saw there."""
+"""What a bench needs of a head with cameras: to look somewhere, and to report what it saw there."""
 
 from __future__ import annotations
 
@@ -24,27 +24,15 @@ class BenchInterrupted(MastctlError):
 
 
 class NoLight(BenchInterrupted):
-    """Every camera's picture at an attitude is too dark, or too bright, to be used; elsewhere it may do."""
-
-    code = "interrupted"
+    """Every camera's image at an attitude is too dark, or too bright, to be used; elsewhere it may do."""
 
 
 @dataclass(frozen=True, eq=False)
 class SeenBoard:
-    """One camera's picture of a look.
+    """One camera's image of a look.
 
-    Attributes
-    ----------
-    camera
-        Its name.
-    pan_rad, tilt_rad
-        What the joints read at mid-exposure, radians.
-    corners
-        Of the board, or None.
-    why
-        Why there are none, in words.
-    data
-        The picture's file, PNG; empty where only corners are simulated.
+    ``pan_rad``, ``tilt_rad``: what the joints read at mid-exposure; ``corners`` of the board, or None and
+    ``why`` there are none; ``data``: the image's file, PNG, empty where only corners are simulated.
     """
 
     camera: str
@@ -57,8 +45,8 @@ class SeenBoard:
 
 @dataclass(frozen=True, eq=False)
 class BenchLook:
-    """Cameras' pictures at one attitude, from which side each joint came (1, -1, 0 unknown), and how long
-    it took, seconds of the rover's clock."""
+    """Cameras' images at one attitude, from which side each joint came (1, -1, 0 unknown), and how long it
+    took, seconds of the rover's clock."""
 
     seen: tuple[SeenBoard, ...]
     pan_approach: int
@@ -77,12 +65,12 @@ class BenchLook:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Those that were to take a picture."""
+        """Those that were to take an image."""
         return tuple(one.camera for one in self.seen)
 
     @property
     def found(self) -> tuple[SeenBoard, ...]:
-        """The pictures that show the board."""
+        """The images that show the board."""
         return tuple(one for one in self.seen if one.corners is not None)
 
 
@@ -90,16 +78,8 @@ class BenchLook:
 class BenchHead:
     """What is known of a head before it is calibrated.
 
-    Attributes
-    ----------
-    rig
-        The mast file in use: rough is enough.
-    pan_limits_rad, tilt_limits_rad
-        Within which it may turn.
-    one_sided
-        Whether it approaches every goal from one side by itself.
-    count_rad
-        What one count of its encoders is, the coarser of both; 0 where nobody knows.
+    ``rig`` is the mast file in use: rough is enough. ``one_sided``: whether it approaches every goal from one
+    side by itself. ``count_rad``: one count of its encoders, the coarser of both; 0 where it is unknown.
     """
 
     rig: Rig
@@ -124,16 +104,16 @@ class BenchEyes(Protocol):
         approach: tuple[int, int] = (0, 0),
         cameras: Collection[str] | None = None,
     ) -> BenchLook:
-        """Turn to joint readings, radians, from the sides asked for (0: any), and take some cameras at rest,
-        all of them by default.
+        """Turn to joint readings, from the sides given (0: any), and take some cameras' images at rest, by
+        default of all.
 
         Raises
         ------
         NotThere
             If the head must not go there.
         NoLight
-            If the pictures are too dark or too bright.
+            If the images are too dark or too bright.
         MastctlError
-            If the head does not get there, or no camera gives a picture.
+            If the head does not get there, or no camera gives an image.
         """
         ...

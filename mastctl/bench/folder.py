@@ -1,4 +1,4 @@
-"""A run on disk: the survey's folder, which holds all that was seen, and a journal of what was done."""
+"""A run on disk: the survey's folder with all that was seen, and a journal of what was done."""
 
 from __future__ import annotations
 
@@ -29,23 +29,10 @@ FORMER = "former_mast.yaml"
 
 
 class RunFolder:
-    """The folder of one run; whatever it was told is on the disk when a call returns.
+    """The folder of one run; whatever it was given is on the disk when a call returns.
 
-    Parameters
-    ----------
-    path
-        A new folder, or that of a run with the same board and cameras, which goes on.
-    boards
-        The board by its name.
-    sigma
-        Of a corner, pixels, and of a joint's reading, radians.
-    cameras, stereo
-        As of a survey.
-
-    Attributes
-    ----------
-    let_go
-        Call it, and another run may go on with the folder; the end of the process does the same.
+    A new folder, or that of a run with the same boards (by name), sigmas and cameras, which goes on. Once
+    ``let_go`` is called another run may go on with it; the end of the process does the same.
 
     Raises
     ------
@@ -66,7 +53,7 @@ class RunFolder:
         self.let_go = weakref.finalize(self, os.close, _locked(path))
         self._cameras = cameras
         self._journal = path / JOURNAL
-        self.notes = _read_notes(self._journal)
+        self.notes = read_notes(path)
         self._numbers: dict[str, int] = {}
         for image in self._folder.survey().images:
             number = _number_of(image, path)
@@ -81,7 +68,7 @@ class RunFolder:
         except OSError as error:
             raise NotWritten(path, "", f"cannot be written: {error.strerror or error}") from None
         if frame.stated and frame != frame_of(self.notes):
-            self.note(event="frame", **frame.told())
+            self.note(event="frame", **frame.as_json())
 
     def survey(self) -> Survey:
         """Return all that was seen."""
@@ -173,27 +160,15 @@ def moved_placements(notes: Iterable[Mapping[str, Any]]) -> dict[str, float]:
     return {str(note["name"]): float(note["apart_px"]) for note in notes if note.get("event") == "moved"}
 
 
-def kept_moved(folder: Path) -> dict[str, float]:
-    """Return the placements of a folder's run that moved (see `RunFolder.moved`). Raises BadFile."""
-    return moved_placements(_read_notes(folder / JOURNAL))
-
-
-def kept_frame(folder: Path) -> RoverFrame:
-    """Return what the rover frame of a folder's run hangs on. Raises BadFile."""
-    return frame_of(_read_notes(folder / JOURNAL))
-
-
-def survey_cameras(rig: Rig, names: Mapping[str, tuple[int, int]]) -> dict[str, SurveyCamera]:
-    """Return what a survey says of a rig's cameras beforehand; ``names`` gives their pictures' sizes."""
-
+def survey_cameras(rig: Rig) -> dict[str, SurveyCamera]:
+    """Return what a survey says of a rig's cameras beforehand."""
     cameras = {}
-    for name, size_px in names.items():
-        held = rig.cameras[name]
-        model = held.model
-        focal_px = model.focal_px[0]
-        kind = "CAHVOR" if model.kind == "CAHV" else model.kind
+    for name, camera in rig.cameras.items():
+        model = camera.model
+        kind = cast(Any, "CAHVOR" if model.kind == "CAHV" else model.kind)
+        focal_px = round(model.focal_px[0], 1)
         cameras[name] = SurveyCamera(
-            name, held.on, size_px, cast(Any, kind), round(focal_px, 1), sensor_mode=held.sensor_mode
+            name, camera.on, model.size_px, kind, focal_px, sensor_mode=camera.sensor_mode
         )
     return cameras
 
@@ -234,8 +209,9 @@ def _number_of(image: SurveyImage, path: Path) -> int:
     return int(number)
 
 
-def _read_notes(path: Path) -> list[dict[str, Any]]:
-    """The journal's lines; one that a kill cut short is passed over."""
+def read_notes(folder: Path) -> list[dict[str, Any]]:
+    """Return the lines of a run's journal; one that a kill cut short is passed over. Raises BadFile."""
+    path = folder / JOURNAL
     notes: list[dict[str, Any]] = []
     try:
         lines = path.read_bytes().splitlines()

@@ -17,6 +17,7 @@ from calib.geometry.rig import Mast, Rig
 from calib.geometry.rigid import Rigid
 from calib.plan.placements import FEWEST
 from calib.survey.records import Survey
+from mastctl.as_json import as_json
 from mastctl.calibration.differences import implied_motion
 from mastctl.errors import MastctlError
 
@@ -25,7 +26,7 @@ UPRIGHT = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 class NoSuchFrame(MastctlError):
-    """The object that should define the rover frame is not there."""
+    """The object that should define the rover frame is missing."""
 
     code = "no_such_frame"
     exit_code = 2
@@ -33,30 +34,22 @@ class NoSuchFrame(MastctlError):
 
 @dataclass(frozen=True)
 class RoverFrame:
-    """What the rover frame hangs on: one of these, or where the former mast file has the mast.
+    """What fixes the rover frame: one of these, or where the former mast file has the mast.
 
-    Attributes
-    ----------
-    mast_at
-        The mast at zero angles, as a level and a tape say: x, y, z, metres, and three angles, radians, as in
-        a mast file.
-    board_at
-        The board of the first placement: x, y, z of its middle, metres, and yaw, pitch, roll, degrees, about
-        the rover's z, y, x. 0 0 0: upright, its face to the rover.
-    body
-        Body cameras stay where the former mast file has them.
+    ``mast_at``: the mast at zero angles, by a level and a tape: x, y, z, metres, and three angles, radians,
+    as in a mast file. ``board_at``: the board of the first placement: x, y, z of its middle, metres, and yaw,
+    pitch, roll, degrees, about the rover's z, y, x; 0 0 0: upright, its face to the rover. ``body``: body
+    cameras stay where the former mast file has them.
     """
 
     mast_at: Sequence[float] | None = None
     board_at: Sequence[float] | None = None
     body: bool = False
 
-    def told(self) -> dict[str, Any]:
-        """Return it as JSON."""
-        if self.body:
-            return {"body": True}
-        numbers = {"mast_at": self.mast_at, "board_at": self.board_at}
-        return {key: list(value) for key, value in numbers.items() if value is not None}
+    def as_json(self) -> dict[str, Any]:
+        """Return what is stated."""
+        numbers = {"mast_at": self.mast_at, "board_at": self.board_at, "body": self.body or None}
+        return {key: as_json(value) for key, value in numbers.items() if value is not None}
 
     @property
     def stated(self) -> bool:
@@ -65,13 +58,13 @@ class RoverFrame:
 
 
 def frame_of(notes: Sequence[Mapping[str, Any]]) -> RoverFrame:
-    """Return what a run's journal says the frame hangs on."""
-    told: Mapping[str, Any] = next((note for note in reversed(notes) if note.get("event") == "frame"), {})
-    return RoverFrame(told.get("mast_at"), told.get("board_at"), bool(told.get("body")))
+    """Return what fixes the frame by a run's journal."""
+    note: Mapping[str, Any] = next((note for note in reversed(notes) if note.get("event") == "frame"), {})
+    return RoverFrame(note.get("mast_at"), note.get("board_at"), bool(note.get("body")))
 
 
 def rover_from_board(board_at: Sequence[float]) -> Rigid:
-    """Return the pose of a board that was told in metres and degrees (see `RoverFrame`)."""
+    """Return the pose of a board that is stated in metres and degrees (see `RoverFrame`)."""
     turn = Rotation.from_euler("ZYX", board_at[3:], degrees=True).as_matrix()
     return Rigid(turn @ UPRIGHT, np.array(board_at[:3]))
 
@@ -83,26 +76,17 @@ def fit_in_frame(
     options: BenchOptions | None = None,
     moved: Mapping[str, float] | None = None,
 ) -> BenchCalibration:
-    """Fit a bench in the rover frame that was stated.
+    """Fit a bench in the rover frame that was stated; ``former`` is the rig as it was known before.
 
-    Parameters
-    ----------
-    survey
-        What was seen.
-    frame, former
-        What the frame hangs on, and the rig as it was known before.
-    options
-        What else is chosen.
-    moved
-        Placements at whose end the first picture was taken again and showed the board aside, by so many
-        pixels. Where the fit does not find out what moved when, it does without them.
+    ``moved``: placements at whose end the first image was taken again and showed the board aside, by so many
+    pixels. Where the fit does not find out what moved when, it does without them.
 
     Raises
     ------
     NoSuchFrame
-        If the frame hangs on something that is not there.
+        If the frame hangs on something that is missing.
     BenchNotFitted
-        If the pictures do not determine a rig.
+        If the images do not determine a rig.
     """
     options = options or BenchOptions()
     try:
@@ -113,7 +97,7 @@ def fit_in_frame(
         rest = tuple(image for image in survey.images if image.placement not in (moved or {}))
         if not moved or not rest:
             raise
-        told = [
+        sentences = [
             f"the board or the head moved during placement {name} (its first picture taken again shows the "
             f"board {apart_px:.1f} px aside): its pictures are left out"
             for name, apart_px in moved.items()
@@ -122,8 +106,10 @@ def fit_in_frame(
         try:
             done = _fit_in_frame(replace(survey, images=rest, corners=corners), frame, former, options)
         except BenchNotFitted:
-            raise BenchNotFitted(f"{'; '.join(told)}, and what is left is too little: {reason}") from None
-        return replace(done, notes=(*done.notes, *told))
+            raise BenchNotFitted(
+                f"{'; '.join(sentences)}, and what is left is too little: {reason}"
+            ) from None
+        return replace(done, notes=(*done.notes, *sentences))
 
 
 def _fit_in_frame(
@@ -218,20 +204,11 @@ LEAST_PX, LEAST_SCALE = 0.01, 0.1
 
 @dataclass(frozen=True, eq=False)
 class FittedBench:
-    """A survey's fit.
+    """A survey's fit, with all that it says in ``calibration``; None of a stand-in.
 
-    Attributes
-    ----------
-    rig
-        Cameras, mast and joints.
-    boards
-        Placement to rover_from_board; of a board that moved meanwhile, where it stood last.
-    corner_rms_px
-        Rms per axis of the fitted corners.
-    sigma_scale
-        How large residuals are against the sigmas that corners came with.
-    calibration
-        All of what the fit tells; None of a stand-in.
+    ``boards``: placement to rover_from_board; of a board that moved meanwhile, where it stood last.
+    ``corner_rms_px``: of the fitted corners, per axis. ``sigma_scale``: how large residuals are against the
+    sigmas that corners came with.
     """
 
     rig: Rig

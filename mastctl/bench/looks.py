@@ -6,7 +6,7 @@ The board is found, what tells most is taken of it, and it is seen that it staye
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,30 +17,20 @@ from calib.plan.poses import AttitudeChoice, next_shot
 from mastctl.bench.eyes import BenchEyes, BenchLook, NotThere
 from mastctl.bench.known import BenchKnowledge
 from mastctl.bench.reporter import BenchProgress, Reporter
-from mastctl.bench.search import BoardSearch
+from mastctl.bench.search import find_board
 from mastctl.errors import MastctlError
 
 FEWEST_LOOKS = 8
 """Of a placement: fewer leave the board's own place, and so what it tells, to chance."""
-
-TURN_S = 1.5
-"""Between two looks, for the head to get there."""
 
 
 @dataclass(frozen=True)
 class BenchGoal:
     """What a run is to reach, and when it stops trying.
 
-    Attributes
-    ----------
-    pointing_px
-        Rms per axis of a first pointing that the calibration may leave, on paper.
-    pictures
-        Of a camera, at most; the check's are among them.
-    placements
-        Fewest and most.
-    checks
-        Looks that are not fitted.
+    ``pointing_px``: rms per axis of a first pointing that the calibration may leave, on paper;
+    ``pictures`` of a camera, at most, the check's among them; fewest and most ``placements``; ``checks`` that
+    are not fitted.
     """
 
     pointing_px: float = 0.2
@@ -52,34 +42,6 @@ class BenchGoal:
         """Return what the calibration may leave: as asked, or what counts leave anyway."""
         return max(self.pointing_px, counts_px)
 
-    def will_take(self, picture_s: Mapping[str, float], pointing: Collection[str], choice_s: float) -> str:
-        """Return in words how long a run takes.
-
-        Parameters
-        ----------
-        picture_s
-            Of each camera, how long a picture and finding its corners take, seconds.
-        pointing
-            The cameras of which each look takes a picture; of the others only where they may see the board.
-        choice_s
-            How long it takes to choose where to look next, seconds.
-        """
-        fewest = self.placements[0] * FEWEST_LOOKS + self.checks
-        least_s = choice_s + TURN_S + sum(picture_s[name] for name in pointing)
-        most_s = choice_s + TURN_S + sum(picture_s.values())
-        slowest = max(picture_s, key=picture_s.__getitem__)
-        return (
-            f"{fewest} to {self.pictures} looks will take {_minutes(fewest * least_s)} to "
-            f"{_minutes(self.pictures * most_s)} minutes here. One of all {len(picture_s)} cameras "
-            f"{most_s:.1f} s ({slowest} {picture_s[slowest]:.1f} s, the choice of the next "
-            f"{choice_s:.1f} s), "
-            f"of {', '.join(pointing)} alone {least_s:.1f} s; --cameras leaves others out"
-        )
-
-
-def _minutes(seconds: float) -> str:
-    return f"{seconds / 60.0:.2g}" if seconds < 600.0 else f"{seconds / 60.0:.0f}"
-
 
 LITTLE_GAIN, LAST_GAIN = 0.12, 0.01
 """A look that promises less than this part of the predicted error is not worth its time at a placement, or at
@@ -89,7 +51,7 @@ MOVED_PX = 1.0
 """Corners further off than this at one and the same attitude, on the median, say that something moved."""
 
 UNSEEN_IN_A_ROW = 4
-"""Looks in a row that did not show the board where it was expected: it was taken away, or has moved."""
+"""Looks in a row without the board where it was expected: it was taken away, or has moved."""
 
 
 class BoardLost(MastctlError):
@@ -99,19 +61,7 @@ class BoardLost(MastctlError):
 
 
 class Looks:
-    """Looks at boards through a head's cameras.
-
-    Parameters
-    ----------
-    eyes
-        The head and its cameras.
-    known
-        What is known, and learns by every look.
-    reporter
-        Shows how it goes.
-    wanted
-        What to reach.
-    """
+    """Looks at boards through a head's cameras, of which ``known`` learns."""
 
     def __init__(self, eyes: BenchEyes, known: BenchKnowledge, reporter: Reporter, wanted: BenchGoal) -> None:
         self._eyes, self._known, self._reporter, self._wanted = eyes, known, reporter, wanted
@@ -119,24 +69,15 @@ class Looks:
         """The placement that was worked at, and whose board so stands there."""
 
     def find(self, name: str, placement: Placement) -> None:
-        """Look for a board that was placed anew.
-
-        Raises
-        ------
-        BoardNotFound
-            With what the pictures showed instead.
-        """
+        """Look for a board that was placed anew. Raises BoardNotFound."""
         self._reporter.step("search")
-        search = BoardSearch(self._eyes, self._known.now, self._known.sought, self._reporter)
-        self._known.take(name, search.find(placement))
+        known = self._known
+        known.take(name, find_board(self._eyes, known.now, known.sought, self._reporter, placement))
 
     def work_at(self, name: str, most: int) -> None:
         """Take what tells most of a board that was found, ``most`` looks or until others tell more.
 
-        Raises
-        ------
-        BoardLost
-            If it is not there any more.
+        Raises BoardLost if it is not there any more.
         """
         known, self.here = self._known, name
         self._reporter.step("pictures")

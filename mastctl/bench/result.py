@@ -15,9 +15,10 @@ from calib.files.mast_file import StoredRig, joint_keys
 from calib.geometry.rig import Rig
 from calib.survey.records import Survey
 from mastctl.as_json import as_json
+from mastctl.bench.check import Checked
 from mastctl.bench.frame import RoverFrame, fit_in_frame
 from mastctl.bench.reporter import Reporter, px
-from mastctl.bench.run import BenchRun, Checked
+from mastctl.bench.run import BenchRun
 from mastctl.calibration.drawn import cells_seen
 from mastctl.calibration.landing import expected_pointing
 from mastctl.calibration.mast_file import fit_document, picked, save_new, with_fit

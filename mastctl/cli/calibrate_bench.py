@@ -99,7 +99,8 @@ def survey_folder(out: Path) -> Path:
 def _again(args: argparse.Namespace) -> Answer:
     from calib.calibrate.bench.problem import BenchOptions
     from calib.survey.reader import read_survey
-    from mastctl.bench.folder import former_rig, kept_frame, kept_moved
+    from mastctl.bench.folder import former_rig, moved_placements, read_notes
+    from mastctl.bench.frame import frame_of
     from mastctl.bench.result import fit_again
 
     survey = read_survey(args.folder)
@@ -109,12 +110,13 @@ def _again(args: argparse.Namespace) -> Answer:
             f"{args.folder} is a survey with a station; 'mastctl calibrate {args.folder}' fits it",
             2,
         )
+    notes = read_notes(args.folder)
     frame = _frame(args)
     if not frame.stated:
-        frame = kept_frame(args.folder)
+        frame = frame_of(notes)
     options = BenchOptions(kind=args.model)
     with output.waiting(args.json, f"fitting {len(survey.images)} images"):
-        former, moved = former_rig(args.folder), kept_moved(args.folder)
+        former, moved = former_rig(args.folder), moved_placements(notes)
         done = fit_again(survey, args.out, args.report, options, frame, former, moved)
     if args.compare_models and args.model is not None:
         survey = survey.as_model(args.model)

@@ -60,9 +60,8 @@ def corner_bench(
 def kept_in(folder: Path, bench: CornerBench) -> RunFolder:
     """The run's folder."""
     rig = bench.head.rig
-    sizes = {name: camera.model.size_px for name, camera in rig.cameras.items()}
     sigma = Sigma(0.0, 0.0, joint_rad=PTU_COUNT_RAD / 12**0.5, corner_px=bench.noise_px)
-    return RunFolder(folder, {"board": BOARD}, sigma, survey_cameras(rig, sizes), rig.stereo)
+    return RunFolder(folder, {"board": BOARD}, sigma, survey_cameras(rig), rig.stereo)
 
 
 def run_of(

@@ -29,7 +29,7 @@ from hil_tests.mastctl.service_fakes import FakeHardware
 from mastctl.bench.eyes import BenchInterrupted, BenchLook, NoLight
 from mastctl.bench.folder import looks_of
 from mastctl.bench.run import BenchRun
-from mastctl.bench.search import BoardNotFound, BoardSearch
+from mastctl.bench.search import BoardNotFound, find_board
 from mastctl.cli import calibrate_bench
 from mastctl.cli.main import main
 from mastctl.daemon import RunningDaemon
@@ -202,5 +202,5 @@ def test_dark_or_blurred_views_do_not_end_a_search_before_the_board(
     in_the_night(bench, [why])
     asked = Placement(2.0, 0.0, 0.0, (0.0, 0.0))
     bench.stand(replace(asked, bearing_deg=math.degrees(ASIDE_RAD)))
-    look = BoardSearch(bench, run.known.now, run.known.sought, teller).find(asked)
+    look = find_board(bench, run.known.now, run.known.sought, teller, asked)
     assert look.found and bench.looks > 24
