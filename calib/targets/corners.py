@@ -45,12 +45,6 @@ from calib.targets.markers import (
 from calib.targets.pattern import Cells, pattern_of
 from calib.targets.saddles import Crossings, Saddles, fit_saddles
 
-DARK_DN = 40
-"""Where next to no pixel is brighter, there is no light."""
-
-FLAT_DN = 20
-"""Between the darkest and the brightest pixels: less is no picture."""
-
 MOST_ELSEWHERE = 0.5
 """Of the markers found; if more do not stand as on the board, it is another."""
 
@@ -60,9 +54,6 @@ OTHERS = (
 )  # fmt: skip
 BLURRED_PX, SMEARED, SMOOTH_PX = 2.0, 2.0, 1.0
 """Standard deviation of a blur that is stated; of one direction against the other; of the smoothing."""
-
-FEWEST_OTHERS = 6
-FEWEST_MIRRORED = 3
 
 
 def doubled(board: MarkerBoard, markers: Markers, placed: PlacedMarkers | None) -> str:
@@ -131,9 +122,9 @@ def _turned_tags(board: AprilGrid, markers: Markers) -> int:
 def why_nothing(board: AnyBoard, image: Grey8) -> str:
     """Say why no board is seen."""
     dark, bright = (float(value) for value in np.percentile(image, (1.0, 99.5)))
-    if bright < DARK_DN:
+    if bright < 40:
         return f"the picture is too dark: all but the brightest 0.5 % of it is below {bright:.0f} of 255"
-    if bright - dark < FLAT_DN:
+    if bright - dark < 20:
         return f"the picture shows next to nothing: its levels are between {dark:.0f} and {bright:.0f} of 255"
     if isinstance(board, Charuco | AprilGrid):
         reason = _mirrored(board, image) or _others(board, image)
@@ -146,7 +137,7 @@ def why_nothing(board: AnyBoard, image: Grey8) -> str:
 
 def _mirrored(board: MarkerBoard, image: Grey8) -> str:
     flipped = detect(np.ascontiguousarray(image[:, ::-1]), board)
-    if placed_markers(flipped, board) is None or len(flipped.ids) < FEWEST_MIRRORED:
+    if placed_markers(flipped, board) is None or len(flipped.ids) < 3:
         return ""
     return "the board is mirrored: it was printed or the picture was taken the wrong way round"
 
@@ -180,7 +171,7 @@ def _others(board: MarkerBoard, image: Grey8) -> str:
         if (dictionary.split("_")[:2], width) == (mine.split("_")[:2], border):
             continue
         found = search(image, dictionary, width)
-        if len(found.ids) >= FEWEST_OTHERS:
+        if len(found.ids) >= 6:  # one or two are read into anything
             other = f"{dictionary} with a border of {width}" if "APRIL" in dictionary else dictionary
             return f"another board is in view: its markers are of {other}, not of {mine}"
     return ""
@@ -206,33 +197,10 @@ def _some(numbers: list[int]) -> str:
     return first + (f" and {len(numbers) - 4} more" if len(numbers) > 4 else "")
 
 
-LEAST_SIGMA_PX = 0.001
-"""The best that aliasing and whole grey levels allow."""
-
 FARTHEST_PX = 4.0
 """A corner is looked for so far from where the markers say that it is."""
 
-WORST_SIGMA_PX = 0.3
-UNSURE = 6.0
-"""A corner is dropped if it is so much less sure than the others: half covered."""
-
-BESIDE_RIM = 2.0
-"""Standard deviations of the blur that a corner is away from the picture's rim at least."""
-
-CONTRAST = 0.35
-"""Of the others' median, at least; a corner half behind something has less."""
-
-WIDEST = 1.7
-"""Of the others' median, what blurs an edge at most: something that lies across it makes it wider."""
-
-LEFT_OVER = 0.12
-"""Of its contrast, at most, or three times what is usual in the image."""
-
-FAR_OFF = 6.0
-"""Sigmas from the map of all corners, beyond which a corner is dropped."""
-
 FEWEST = 4
-ROUNDS = 6
 
 
 def find_corners(board: AnyBoard, image: Levels) -> Corners | CornersNotFound:
@@ -342,35 +310,36 @@ def _insets_m(board: Charuco | AprilGrid | Checkerboard) -> FloatArray:
 
 
 def _inside(found: _Found, shape: tuple[int, ...]) -> _Found:
-    """Leave out what is nearer to the image's rim than the blur reaches, or beside it."""
-    rim = BESIDE_RIM * found.saddles.wide_px.max(axis=1, initial=0.0) - 0.5
+    """Leave out what is nearer to the image's rim than two standard deviations of the blur, or beside it."""
+    rim = 2.0 * found.saddles.wide_px.max(axis=1, initial=0.0) - 0.5
     x, y = found.saddles.pixels_px.T
     kept = (x > rim) & (y > rim) & (x < shape[1] - 1 - rim) & (y < shape[0] - 1 - rim)
     return _Found(found.ids[kept], Saddles(*(part[kept] for part in found.saddles)))
 
 
 def _good(saddles: Saddles) -> NDArray[np.bool_]:
-    """Which corners look like the others."""
+    """Which corners look like the others.
+
+    One that is half covered is less sure, or has less contrast; what lies across an edge makes it wider.
+    """
     fitted = np.isfinite(saddles.sigma_px)
     if not fitted.any():
         return fitted
     with np.errstate(invalid="ignore", divide="ignore"):
         left_over = saddles.noise / saddles.contrast
-        good = fitted & (
-            saddles.sigma_px < min(WORST_SIGMA_PX, UNSURE * float(np.nanmedian(saddles.sigma_px)))
-        )
-        good &= saddles.contrast > CONTRAST * np.nanmedian(saddles.contrast)
-        good &= (saddles.wide_px < WIDEST * np.nanmedian(saddles.wide_px, axis=0)).all(axis=1)
-        return np.asarray(good & (left_over < max(LEFT_OVER, 3.0 * float(np.nanmedian(left_over)))))
+        good = fitted & (saddles.sigma_px < min(0.3, 6.0 * float(np.nanmedian(saddles.sigma_px))))
+        good &= saddles.contrast > 0.35 * np.nanmedian(saddles.contrast)
+        good &= (saddles.wide_px < 1.7 * np.nanmedian(saddles.wide_px, axis=0)).all(axis=1)
+        return np.asarray(good & (left_over < max(0.12, 3.0 * float(np.nanmedian(left_over)))))
 
 
 def _agreeing(board: AnyBoard, found: _Found) -> Corners | CornersNotFound:
     """The corners that fit a smooth map of all."""
     points = board.in_board_m(found.ids)[:, :2]
     pixels = found.saddles.pixels_px
-    sigma = np.hypot(found.saddles.sigma_px, LEAST_SIGMA_PX)
+    sigma = np.hypot(found.saddles.sigma_px, 0.001)  # the best that aliasing and whole grey levels allow
     good = np.ones(len(points), dtype=bool)
-    for _ in range(ROUNDS):
+    for _ in range(6):
         plane_map = fit_plane_map(points[good], pixels[good])
         if plane_map is None or 2 * int(good.sum()) - plane_map.parameters < 6:
             break
@@ -379,7 +348,7 @@ def _agreeing(board: AnyBoard, found: _Found) -> Corners | CornersNotFound:
         off = np.linalg.norm(plane_map.pixels(points) - pixels, axis=-1) / least
         # by the median: a corner far off does not excuse itself
         usual = float(np.median(off[good])) / 1.177
-        far = good & (off > FAR_OFF * max(1.0, usual))
+        far = good & (off > 6.0 * max(1.0, usual))
         if not far.any() or good.sum() - far.sum() < FEWEST:
             break
         good &= ~far

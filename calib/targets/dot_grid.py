@@ -25,11 +25,8 @@ from calib.targets.boards import Board, CornersNotFound, Grey8
 from calib.targets.dot_middles import centred
 from calib.targets.dot_spots import UNEVEN_AT_MOST, Candidates, contrasts
 
-DEGREES = (0, 3, 5)
-"""Of the polynomial; the number of dots decides which."""
-
-DOTS_FOR_DEGREE = (0, 40, 90)
-STEP = 1e-4  # of the numeric derivative, in units of the board's half size
+DEGREES = {0: 0, 3: 40, 5: 90}
+"""Of the polynomial, and for how many dots."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +52,7 @@ class PlaneMap:
     def jacobian(self, points_m: ArrayLike) -> FloatArray:
         """Return d pixel / d point (..., 2, 2), px/m."""
         points = np.asarray(points_m, dtype=np.float64)
-        step = STEP * self.scale_m
+        step = 1e-4 * self.scale_m
         sides = [
             (self.pixels(points + step * axis) - self.pixels(points - step * axis)) / (2 * step)
             for axis in np.eye(2)
@@ -95,7 +92,7 @@ def fit_plane_map(points_m: FloatArray, pixels_px: FloatArray) -> PlaneMap | Non
         return None
     back = np.array([[1.0, 0.0, middle[0]], [0.0, 1.0, middle[1]], [0.0, 0.0, 1.0]])
     whole = np.asarray(back @ H @ np.diag([1 / scale, 1 / scale, 1.0]), dtype=np.float64)
-    degree = max(d for d, least in zip(DEGREES, DOTS_FOR_DEGREE, strict=True) if len(points_m) >= least)
+    degree = max(degree for degree, least in DEGREES.items() if len(points_m) >= least)
     flat = PlaneMap(whole, np.empty((0, 2)), 0, scale)
     if not degree:
         return flat
@@ -114,8 +111,6 @@ def _powers(points: FloatArray, degree: int) -> FloatArray:
 
 NEAR = 0.35  # how far a neighbour may be from where it is expected, in spacings
 SIZES = (0.5, 2.0)  # areas of neighbours, one to the other
-LOOK_AT = 10  # nearest spots looked at for each
-LEAST_GRID = 6
 
 
 class Lattice(NamedTuple):
@@ -148,7 +143,7 @@ def _links(found: Candidates, spacing_over_radius: float) -> list[list[int]]:
     count = len(found.middles_px)
     if count < 2:
         return [[] for _ in range(count)]
-    nearest = cKDTree(found.middles_px).query(found.middles_px, k=min(LOOK_AT + 1, count))[1]
+    nearest = cKDTree(found.middles_px).query(found.middles_px, k=min(11, count))[1]
     near = np.asarray(nearest)[:, 1:]
     offsets = found.middles_px[near] - found.middles_px[:, None, :]
     there = _in_circles(np.linalg.inv(found.shapes_px)[:, None], offsets)
@@ -191,7 +186,7 @@ def _grown(middles: FloatArray, links: list[list[int]], start: int) -> Lattice |
             bases[j] = bases[i].copy()
             bases[j][:, axis] = step * whole[axis]
             queue.append(j)
-    if len(place) < LEAST_GRID:
+    if len(place) < 6:
         return None
     return Lattice(np.array(list(place)), _unsheared(np.array(list(place.values()))))
 

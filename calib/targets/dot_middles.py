@@ -29,19 +29,6 @@ REACH = 2.0
 BLURS = 5.0
 """How far beyond the outline the fit looks, in blurs or pixels, for dots large enough."""
 
-MOST_POINTS_ACROSS = 60
-"""Of the pixels across a large dot only every second (third, ...) is used beyond this."""
-
-ITERATIONS = 8
-SETTLED_PX = 2e-3
-START_BLUR_PX = 0.8
-BLUR_PX = (0.25, 6.0)
-FARTHEST_PX = 1.5
-"""A fit that moves farther than this, or than half the radius, has not found the dot that was expected."""
-
-SIZE_SIGMA = 0.1
-"""Relative, of a dot's printed size."""
-
 PARAMETERS = 8
 BOUNDARY_POINTS = 32
 
@@ -73,17 +60,17 @@ def fit_ellipses(image: Levels, middles_px: FloatArray, shapes_px: FloatArray) -
     normal = np.zeros((count, PARAMETERS, PARAMETERS))
     square = np.full(count, np.nan)
     radius = np.sqrt(np.abs(np.linalg.det(shapes_px)))
-    farthest = np.minimum(FARTHEST_PX, 0.5 * radius)
+    farthest = np.minimum(1.5, 0.5 * radius)  # what moves more has not found the dot that was expected
     freedom = weights.sum(axis=1) - PARAMETERS
-    for _ in range(ITERATIONS):
+    for _ in range(8):
         some = np.flatnonzero(open_)
         residual, J = _model(state[some], u[some], form[some], levels[some], weights[some])
         JT = J.transpose(0, 2, 1)
         normal[some] = JT @ J
         square[some] = (residual**2).sum(axis=1)
         gradient = JT @ residual[..., None]
-        # The board's drawing says how large its dots are; a small blurred dot does not tell by itself.
-        weight = square[some] / np.maximum(freedom[some], 1.0) / SIZE_SIGMA**2
+        # The board's drawing gives the size of its dots to a tenth; a small blurred dot's own fit does not.
+        weight = square[some] / np.maximum(freedom[some], 1.0) / 0.1**2
         normal[some, 2, 2] += weight
         gradient[:, 2, 0] += weight * (1.0 - state[some, 2])
         damped = normal[some] + 1e-4 * diagonals(normal[some]) + 1e-9 * np.eye(PARAMETERS)
@@ -91,8 +78,8 @@ def fit_ellipses(image: Levels, middles_px: FloatArray, shapes_px: FloatArray) -
         step[:, :2] = np.clip(step[:, :2], -0.5, 0.5)
         state[some] = state[some] + step
         state[some, 2] = np.clip(state[some, 2], 0.5, 2.0)
-        state[some, 3] = np.clip(state[some, 3], *BLUR_PX)
-        open_[some] = np.abs(step[:, :2]).max(axis=1) > SETTLED_PX
+        state[some, 3] = np.clip(state[some, 3], 0.25, 6.0)
+        open_[some] = np.abs(step[:, :2]).max(axis=1) > 2e-3
         if not open_.any():
             break
     noise = np.sqrt(square / np.maximum(freedom, 1.0))
@@ -149,7 +136,7 @@ def _patches(
     lengths = np.linalg.svd(shapes_px, compute_uv=False)
     reach = np.minimum(REACH, 1.0 + BLURS / lengths[:, 1])
     half = int(np.ceil((reach * lengths[:, 0]).max()))
-    stride = max(1, -(-(2 * half + 1) // MOST_POINTS_ACROSS))
+    stride = max(1, -(-(2 * half + 1) // 60))  # of a large dot every second pixel will do, or every third
     u, levels, inside = windows(image, middles_px, half, stride)
     q = np.linalg.norm(u @ np.linalg.inv(shapes_px).transpose(0, 2, 1), axis=-1)
     return u, levels, (inside & (q < reach[:, None])).astype(np.float64)
@@ -162,7 +149,7 @@ def _start(levels: FloatArray, weights: FloatArray, u: FloatArray, form: FloatAr
     paper = _mean_where(levels, weights * (q > (1.0 + 2.0 * outermost) / 3.0))
     dot = _mean_where(levels, weights * (q < 0.7))
     state = np.zeros((len(levels), PARAMETERS))
-    state[:, 2], state[:, 3] = 1.0, START_BLUR_PX
+    state[:, 2], state[:, 3] = 1.0, 0.8
     state[:, 4], state[:, 7] = paper, 1.0 - dot / np.maximum(paper, 1.0)
     return state
 

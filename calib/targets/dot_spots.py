@@ -19,12 +19,8 @@ WIDEST_RATIO = 3.5  # major to minor axis: a board seen more flatly has dots tha
 FILL = (0.80, 1.15)  # area over the area of the ellipse with the same second moments
 UNEVEN = 0.22  # spread of the ring of paper, in units of its contrast to the dot
 UNEVEN_AT_MOST = 0.4  # the same where the strict search found no grid
-RING = 1.6  # of the ring, in dot radii; neighbours begin at 3
 RING_POINTS = 16
-LEAST_RING = 2 / 3
 LEAST_CONTRAST_DN = 14.0
-LEAST_AREA_PX = 6
-MOST_CANDIDATES = 3000
 
 
 class Candidates(NamedTuple):
@@ -55,14 +51,14 @@ def dot_candidates(
     area = stats[:, cv2.CC_STAT_AREA]
     width, height = stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]
     longest = np.maximum(width, height)
-    good = (area >= max(LEAST_AREA_PX, area_px2[0])) & (area <= area_px2[1])
+    good = (area >= max(6, area_px2[0])) & (area <= area_px2[1])
     good &= (longest <= 1.6 * diameter_px + 3) & (longest <= WIDEST_RATIO * np.minimum(width, height))
     good[0] = False
     if not good.any():
         return Candidates(np.empty((0, 2)), np.empty((0, 2, 2)))
     kept = _ellipses(np.asarray(labels, dtype=np.int32), np.flatnonzero(good), count)
     kept = _in_paper(smooth, kept, uneven)
-    if len(kept.middles_px) > MOST_CANDIDATES:
+    if len(kept.middles_px) > 3000:  # gravel
         return Candidates(np.empty((0, 2)), np.empty((0, 2, 2)))
     return kept
 
@@ -103,9 +99,9 @@ def contrasts(smooth: Grey8, middles_px: FloatArray, shapes_px: FloatArray) -> t
     """
     angle = np.arange(RING_POINTS) * (2 * np.pi / RING_POINTS)
     circle = np.stack([np.cos(angle), np.sin(angle)])
-    # half a pixel more: the paper next to a small dot is darkened by the lens
+    # 1.6 radii, for neighbours begin at 3, and half a pixel: the paper next to a dot is darkened by the lens
     length = np.sqrt(np.abs(np.linalg.det(shapes_px)))[:, None, None]
-    ring = middles_px[:, None, :] + ((RING + 0.5 / length) * (shapes_px @ circle)).transpose(0, 2, 1)
+    ring = middles_px[:, None, :] + ((1.6 + 0.5 / length) * (shapes_px @ circle)).transpose(0, 2, 1)
     points = np.concatenate([middles_px[:, None, :], ring], axis=1)
     columns, rows = np.moveaxis(points.astype(np.float32), -1, 0)
     values = _sampled(smooth, columns, rows)
@@ -114,7 +110,7 @@ def contrasts(smooth: Grey8, middles_px: FloatArray, shapes_px: FloatArray) -> t
     seen = inside[:, 1:].sum(axis=1)
     paper = np.where(inside[:, 1:], values[:, 1:], 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        mean = np.where(inside[:, 0] & (seen >= LEAST_RING * RING_POINTS), paper.sum(axis=1) / seen, np.nan)
+        mean = np.where(inside[:, 0] & (seen >= 2 / 3 * RING_POINTS), paper.sum(axis=1) / seen, np.nan)
         spread = np.where(inside[:, 1:], paper - mean[:, None], 0.0)
         return mean - values[:, 0], np.sqrt((spread**2).sum(axis=1) / seen)
 

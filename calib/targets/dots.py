@@ -29,12 +29,6 @@ from calib.targets.dot_spots import Candidates, dot_candidates
 UNSURE = "the grid is found but not which corner is the first: it stands aslant against"
 SMALLEST_DOT_PX = 3.5
 
-LEAST_SIGMA_PX = 0.003
-"""The best that aliasing and whole grey levels allow."""
-
-FAR_OFF = 6.0
-"""Sigmas from the map of all dots, beyond which a dot is dropped."""
-
 
 def find_dots(
     image: Levels, board: Board, expected: PredictedBoard | Upright | None = None
@@ -130,7 +124,7 @@ def _measured(image: Levels, board: Board, grid: BoardGrid, ordered: Ordered) ->
         good = inside & (fit.contrast_dn > 0.4 * np.nanmedian(fit.contrast_dn))
         good &= np.abs(fit.sizes / np.nanmedian(fit.sizes) - 1.0) < 0.25
     least = (1.0 - MOST_MISSING) * board.rows * board.columns
-    sigma = np.hypot(fit.sigma_px, LEAST_SIGMA_PX)
+    sigma = np.hypot(fit.sigma_px, 0.003)  # the best that aliasing and whole grey levels allow
     for _ in range(5):
         if good.sum() < least:
             return CornersNotFound(
@@ -147,7 +141,7 @@ def _measured(image: Levels, board: Board, grid: BoardGrid, ordered: Ordered) ->
         freedom = max(1, 2 * int(good.sum()) - plane_map.parameters)
         excess = np.sqrt(float(np.sum((off[good] / sigma[good, None]) ** 2)) / freedom)
         scale = max(1.0, excess)
-        far = good & (np.linalg.norm(off, axis=-1) > FAR_OFF * scale * sigma)
+        far = good & (np.linalg.norm(off, axis=-1) > 6.0 * scale * sigma)
         if not far.any():
             break
         good &= ~far

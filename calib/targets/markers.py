@@ -19,12 +19,6 @@ from calib.targets.board_file import FAMILIES
 from calib.targets.boards import AprilGrid, Charuco, Checkerboard, Grey8
 from calib.targets.dot_grid import carried, homography
 
-NEIGHBOURS = 16
-FEWEST_NEIGHBOURS = 4
-LEAST_EIGENVALUE = 1e-9
-NEXT = 1.3
-"""A corner lies next to a known one if it is no farther than so many of the widest steps of the grid."""
-
 
 @dataclass(frozen=True, eq=False)
 class MeasuredCorners:
@@ -42,7 +36,7 @@ class MeasuredCorners:
         self, ids: IntArray, places_m: FloatArray, lines_m: tuple[FloatArray, FloatArray]
     ) -> IntArray:
         """Return those of ``ids`` (their places on the board by id) that lie next to a known point."""
-        step_m = NEXT * max(float(np.diff(line).max()) for line in lines_m)
+        step_m = 1.3 * max(float(np.diff(line).max()) for line in lines_m)
         away = np.linalg.norm(places_m[ids][:, None] - self.points_m[None], axis=-1).min(axis=1)
         return np.asarray(ids[away < step_m])
 
@@ -53,8 +47,8 @@ def predicted(known: MeasuredCorners, ids: IntArray, places_m: FloatArray) -> Me
     A homography of the neighbourhood: what the lens bends within it is below a pixel. Left out are corners
     whose neighbours do not determine one.
     """
-    count = min(NEIGHBOURS, len(known.points_m))
-    if not len(ids) or count < FEWEST_NEIGHBOURS:
+    count = min(16, len(known.points_m))
+    if not len(ids) or count < 4:
         return MeasuredCorners(np.empty((0, 2)), np.empty((0, 2)))
     away = np.linalg.norm(known.points_m - places_m[:, None], axis=2)
     near = np.argpartition(away, count - 1, axis=1)[:, :count]
@@ -93,7 +87,7 @@ def _homographies(points: FloatArray, pixels: FloatArray) -> tuple[FloatArray, N
         b = (pixels * weights[..., None]).reshape(n, 2 * k, 1)
         normal = A.transpose(0, 2, 1) @ A
         values = np.linalg.eigvalsh(normal)
-        determined = values[:, 0] > LEAST_EIGENVALUE * values[:, -1]
+        determined = values[:, 0] > 1e-9 * values[:, -1]
         normal[~determined] = np.eye(8)
         h = np.linalg.solve(normal, A.transpose(0, 2, 1) @ b)[..., 0]
         below = np.einsum("nki,ni->nk", points, h[:, 6:]) + 1.0
@@ -103,12 +97,6 @@ def _homographies(points: FloatArray, pixels: FloatArray) -> tuple[FloatArray, N
 
 
 MarkerBoard = Charuco | AprilGrid
-
-LEAST_PERIMETER = 0.01
-"""Of a marker, against the image's longer side; OpenCV's 0.03 loses a far board in a large picture."""
-
-FEW = 0.5
-"""Where fewer of the board's markers are found, the image is searched a second time, twice as large."""
 
 FEWEST = 2
 STANDS_WITHIN = 0.35
@@ -136,7 +124,7 @@ def detect(image: Grey8, board: MarkerBoard) -> Markers:
     dictionary = board.dictionary if isinstance(board, Charuco) else FAMILIES[board.family]
     border = board.border if isinstance(board, AprilGrid) else 1
     found = search(image, dictionary, border)
-    if len(found.ids) < FEW * count_of(board) and max(image.shape) < 5000:
+    if len(found.ids) < 0.5 * count_of(board) and max(image.shape) < 5000:  # again, twice as large
         large = cv2.resize(image, None, fx=2.0, fy=2.0, interpolation=cv2.INTER_CUBIC)
         again = search(np.asarray(large, dtype=np.uint8), dictionary, border)
         if len(again.ids) > len(found.ids):
@@ -159,7 +147,7 @@ def search(image: Grey8, dictionary: str, border: int) -> Markers:
 def _detector(dictionary: str, border: int) -> Any:
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border
-    parameters.minMarkerPerimeterRate = LEAST_PERIMETER
+    parameters.minMarkerPerimeterRate = 0.01  # OpenCV's 0.03 loses a far board in a large picture
     known = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, dictionary))
     return cv2.aruco.ArucoDetector(known, parameters)
 

@@ -157,9 +157,6 @@ def _markers(edges: list[Edge], insets: FloatArray) -> FloatArray:
 HALF_PX = 8
 """A window reaches so far from its corner."""
 
-STEEP = 97.0
-"""Percentile of the slopes in a window that are those of its edges."""
-
 NEAR, FAR = 1.3, 2.5
 """A pixel counts if it is so many standard deviations of the blur away from the nearest marker's border,
 which the model has, and from all else, which it has not: at 1.3 a tenth of it is a marker's, so that a
@@ -215,7 +212,7 @@ def sharpness_px(image: Levels, pixels_px: FloatArray) -> FloatArray:
     levels = windows(image, pixels_px, HALF_PX)[1].reshape(-1, side, side)
     dark, bright = np.percentile(levels, (5.0, 95.0), axis=(1, 2))
     slopes = np.hypot(levels[:, 1:-1, 2:] - levels[:, 1:-1, :-2], levels[:, 2:, 1:-1] - levels[:, :-2, 1:-1])
-    steep = np.percentile(slopes, STEEP, axis=(1, 2)) / 2.0
+    steep = np.percentile(slopes, 97.0, axis=(1, 2)) / 2.0
     return np.asarray((bright - dark) / np.sqrt(2 * np.pi) / np.maximum(steep, 1e-3))
 
 
@@ -250,14 +247,8 @@ def _alone(
     return alone
 
 
-LEAST_PIXELS = 24
-ITERATIONS = 25
-ROUGH_PX, SETTLED_PX, UNDAMPED = 0.05, 1e-3, 1e-2
-START_PX, BLUR_PX = (0.8, 4.0), (0.14, 8.0)
+ROUGH_PX, SETTLED_PX = 0.05, 1e-3
 MOST_TOGETHER = 0.9
-
-WIDER = 1.25
-"""Where an edge turns out so much wider than it was taken for, the pixels that count are chosen again."""
 
 
 class Saddles(NamedTuple):
@@ -290,13 +281,13 @@ def fit_saddles(
     signs = crossings.signs(jacobians)
     slopes = np.linalg.norm(np.linalg.inv(jacobians), axis=2)  # of the board's x and y, m/px
     insets = np.column_stack([crossings.inset_m / slopes, signs])
-    wide = np.clip(sharpness_px(image, pixels_px), *START_PX)
+    wide = np.clip(sharpness_px(image, pixels_px), 0.8, 4.0)
     pixels = pixels_about(image, crossings, pixels_px, jacobians, wide)
     state = _start(pixels, signs, jacobians, wide)
     _minimised(state, pixels, insets, ROUGH_PX)
-    # what is printed nearby reaches farther where edges are wider than they were taken for
+    # what is printed nearby reaches farther where edges are wider than was assumed
     wider = np.flatnonzero(
-        (wide_px(state).max(axis=1) > WIDER * wide) & (np.hypot(*state[:, :2].T) < farthest_px)
+        (wide_px(state).max(axis=1) > 1.25 * wide) & (np.hypot(*state[:, :2].T) < farthest_px)
     )
     if len(wider):
         shift = state[wider, :2]
@@ -316,7 +307,7 @@ def fit_saddles(
     sigma = noise * np.sqrt(np.abs(covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
     contrast = state[:, CONTRAST] * signs
     moved_px = np.linalg.norm(state[:, :2], axis=1)
-    good = settled & (freedom > LEAST_PIXELS) & (moved_px < farthest_px) & (contrast > 0.0)
+    good = settled & (freedom > 24) & (moved_px < farthest_px) & (contrast > 0.0)
     found = Saddles(pixels_px + state[:, :2], sigma, wide_px(state), contrast, noise)
     for values in found:
         values[~good] = np.nan
@@ -350,7 +341,7 @@ def _minimised(
     square = (residual**2).sum(axis=1)
     normal = J.transpose(0, 2, 1) @ J
     gradient = (J.transpose(0, 2, 1) @ residual[..., None])[..., 0]
-    for _ in range(ITERATIONS):
+    for _ in range(25):
         some = np.flatnonzero(open_)
         if not len(some):
             break
@@ -361,7 +352,7 @@ def _minimised(
         step[:, :2] = np.clip(step[:, :2], -1.0, 1.0)
         step[:, SLANTS] = np.clip(step[:, SLANTS], -0.2, 0.2)
         tried = state[some] + step
-        tried[:, BLURS] = np.clip(tried[:, BLURS], *BLUR_PX)
+        tried[:, BLURS] = np.clip(tried[:, BLURS], 0.14, 8.0)
         tried[:, TOGETHER] = np.clip(tried[:, TOGETHER], -MOST_TOGETHER, MOST_TOGETHER)
         residual, J = residuals(tried, *pixels.some(some), insets[some])
         squares = (residual**2).sum(axis=1)
@@ -374,6 +365,6 @@ def _minimised(
         before = damping[some]
         damping[some] = np.where(better, damping[some] * 0.2, damping[some] * 8.0)
         # a small step that gains nothing: at the bottom, unless damping made it small
-        bottom = better | (before < UNDAMPED) | (damping[some] > 1.0)
+        bottom = better | (before < 1e-2) | (damping[some] > 1.0)
         open_[some[(np.abs(step[:, :2]).max(axis=1) < settled_px) & bottom]] = False
     return square, normal, ~open_
