@@ -16,23 +16,10 @@ from calib.survey.disagreements import wrong_dots, wrong_grid, wrong_points, wro
 from calib.survey.mixups import joint_mixups, mixups, sights
 from calib.survey.records import Survey, SurveyCamera, SurveyFinding, SurveyImage
 
-FEWEST_CORNERS, FEWEST_DOTS = 8, 20
-"""Of an image of a bench, and of one of a survey, for a pose that says something about the lens."""
-
-FEWEST_PLACEMENTS = 2
-"""Of a bench's board."""
-
 FEWEST_BOARDS, ENOUGH_BOARDS = 3, 5
 """For a camera, and for the mast; the paper finds 5 to 8 positions adequate."""
 
-DEPTH_RATIO = 1.3
-"""Furthest to nearest board of a camera; at one distance, focal length and place trade for each other."""
-
-AREA = 0.6
-"""Part of a 4 x 3 division of the picture that dots should reach."""
-
-PAN_RANGE_RAD, TILT_RANGE_RAD, STILL_RAD = 0.5, 0.2, 0.02
-
+WANTED_RAD = {"pan": 0.5, "tilt": 0.2}
 MOST_RAD = {"pan": np.pi, "tilt": np.pi / 2}
 
 
@@ -75,7 +62,8 @@ def check_survey(survey: Survey, *, only_camera_images: bool = False) -> tuple[S
 
 def _of_cameras(survey: Survey) -> Iterator[SurveyFinding]:
     """Yield cameras without images, images without dots or corners and picture, and such with few of them."""
-    what, fewest = ("corners", FEWEST_CORNERS) if survey.boards else ("dots", FEWEST_DOTS)
+    # With fewer an image's pose says little about the lens.
+    what, fewest = ("corners", 8) if survey.boards else ("dots", 20)
     counts = {name: len(found) for name, found in (survey.corners or survey.dots).items()}
     clicked = {click.image for click in survey.clicks}
     for name in survey.cameras:
@@ -124,7 +112,7 @@ def _of_cameras(survey: Survey) -> Iterator[SurveyFinding]:
 def _bench_placements(survey: Survey) -> Iterator[SurveyFinding]:
     head = [image for image in survey.images if image.pan_rad is not None and image.purpose != "check"]
     placements = {(i.setup, i.placement, i.board) for i in head if len(survey.corners.get(i.name, ()))}
-    if head and len(placements) < FEWEST_PLACEMENTS:
+    if head and len(placements) < 2:
         yield SurveyFinding(
             "warning",
             "images.csv",
@@ -228,7 +216,7 @@ def _camera_spread(
             f"{ENOUGH_BOARDS} to 8 adequate",
             "Photograph more placements, near and far, towards all corners of the picture",
         )
-    if len(ranges_m) > 1 and max(ranges_m) < DEPTH_RATIO * min(ranges_m):
+    if len(ranges_m) > 1 and max(ranges_m) < 1.3 * min(ranges_m):
         yield SurveyFinding(
             "warning",
             f"camera {name}",
@@ -246,7 +234,7 @@ def _area(camera: SurveyCamera, pixels_px: FloatArray) -> Iterator[SurveyFinding
     cells = np.clip(((pixels_px + 0.5) / np.array(camera.size_px) * (4, 3)).astype(int), 0, (3, 2))
     reached = np.zeros((3, 4), dtype=bool)
     reached[cells[:, 1], cells[:, 0]] = True
-    if reached.mean() >= AREA:
+    if reached.mean() >= 0.6:
         return
     sides = {
         "left": reached[:, :2].mean(),
@@ -273,7 +261,7 @@ def _mast_spread(survey: Survey) -> Iterator[SurveyFinding]:
         return
     joints = np.array([(i.pan_rad, i.tilt_rad) for i in head])
     pan_rad, tilt_rad = np.ptp(joints, axis=0)
-    if max(pan_rad, tilt_rad) < STILL_RAD:
+    if max(pan_rad, tilt_rad) < 0.02:
         yield SurveyFinding(
             "error",
             "the mast",
@@ -281,9 +269,8 @@ def _mast_spread(survey: Survey) -> Iterator[SurveyFinding]:
             "Turn the head to five to eight boards over the range of pan and tilt, with purpose mast",
         )
         return
-    for joint, found, wanted in (("pan", pan_rad, PAN_RANGE_RAD), ("tilt", tilt_rad, TILT_RANGE_RAD)):
+    for (joint, wanted), found, column in zip(WANTED_RAD.items(), (pan_rad, tilt_rad), joints.T, strict=True):
         if found < wanted:
-            column = joints[:, 0 if joint == "pan" else 1]
             yield SurveyFinding(
                 "warning",
                 "the mast",

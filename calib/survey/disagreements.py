@@ -19,15 +19,6 @@ UNITS = {"feet": 3.28084, "inches": 39.3701, "centimetres": 100.0, "millimetres"
 SCALE = 0.03
 """Distances that differ from the design's by more than this in the median are no noise."""
 
-ALIKE = 0.6
-"""A wrong unit stretches every distance; with fewer alike than this part of them, single points are wrong."""
-
-FEWEST_IMAGES = 5
-"""So many images together show every row and column of a board."""
-
-STATED_OFF = 5.0
-"""A station's sigma may be stated so many times too small: a fit finds that, and its verdict says it."""
-
 
 def wrong_units(survey: Survey) -> Iterator[SurveyFinding]:
     """Yield what is wrong with the scale of all prisms, or of all tapes."""
@@ -110,7 +101,7 @@ def wrong_dots(survey: Survey) -> Iterator[SurveyFinding]:
 
 def wrong_grid(survey: Survey) -> Iterator[SurveyFinding]:
     """Yield a board that is said to be larger than any image shows it; its middle would be elsewhere."""
-    if len(survey.dots) < FEWEST_IMAGES:
+    if len(survey.dots) < 5:  # so many together show every row and column
         return
     for what, count in (("row", survey.board.rows), ("column", survey.board.columns)):
         seen = np.concatenate([getattr(dots, f"{what}s") for dots in survey.dots.values()])
@@ -137,7 +128,7 @@ def _ratio(design: Mapping[str, FloatArray], groups: Iterable[Mapping[str, Float
         return None
     median = float(np.median(ratios))
     alike = np.abs(np.array(ratios) / median - 1) < SCALE / 2
-    return median if alike.mean() >= ALIKE else None
+    return median if alike.mean() >= 0.6 else None  # a wrong unit stretches every distance, not single ones
 
 
 def _as_unit(ratio: float, measured: str, designed: str) -> str:
@@ -188,8 +179,8 @@ def _disagreement(
             tested_again,
         )
     else:
-        # A sigma that is stated too small is no blunder: the fit finds it, and widens it.
-        wider = _on_design(design, seen, STATED_OFF * sigma_m)
+        # A sigma that is stated up to five times too small is no blunder: the fit finds it, and widens it.
+        wider = _on_design(design, seen, 5.0 * sigma_m)
         needed = what == "prism"
         refused = needed and bool(wider.doubt or wider.rejected)
         yield SurveyFinding(

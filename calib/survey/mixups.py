@@ -23,10 +23,6 @@ CAMERA_OFF_M, ROUGH_OFF_M = 1.0, 0.25
 SIZE = 1.45
 """How much lens, lean and focal length may change the size of a board."""
 
-ASIDE_RAD = 0.15
-MOST = 0.5
-"""From so many images on, the names are not at fault but a sign, a column or a length."""
-
 Placement = tuple[str, str]
 
 
@@ -132,7 +128,7 @@ def _camera_mixups(survey: Survey, camera: SurveyCamera, mine: list[BoardBearing
             reasons.append(f"its dots are {off:.1f} times {larger} than a board at {range_m:.1f} m shows")
         if reasons:
             doubtful.append((image, " and ".join(reasons)))
-    if len(doubtful) > MOST * len(seen):
+    if len(doubtful) > 0.5 * len(seen):  # not the names are at fault but a sign, a column or a length
         yield SurveyFinding(
             "error",
             f"camera {camera.name}",
@@ -167,14 +163,8 @@ def _reach_rad(camera: SurveyCamera, image: SurveyImage, range_m: float, off_m: 
     if down > np.radians(75):
         return float(np.pi)
     across = half_view / float(np.cos(down))
-    return across + float(np.arcsin(min(1.0, 1.5 * off_m / range_m))) + ASIDE_RAD
+    return across + float(np.arcsin(min(1.0, 1.5 * off_m / range_m))) + 0.15
 
-
-FEWEST_IMAGES = 4
-"""Of a camera; its mounting is taken out by their mean."""
-
-BETTER = 0.6
-"""Another reading of a column is believed if it leaves less than this part of the spread."""
 
 STILL_RAD = 0.1
 """A spread so small says nothing: boards stand anywhere in the picture."""
@@ -187,7 +177,7 @@ def joint_mixups(survey: Survey) -> Iterator[SurveyFinding]:
         [one for one in mine if one.image.purpose != "camera" and one.image.pan_rad is not None]
         for mine in sights(survey).values()
     ]
-    turned = [mine for mine in turned if len(mine) >= FEWEST_IMAGES]
+    turned = [mine for mine in turned if len(mine) >= 4]  # a mean takes the mounting out
     if not turned:
         return
     joints = [np.array([(i.pan_rad, i.tilt_rad) for i, *_ in mine], dtype=np.float64) for mine in turned]
@@ -205,7 +195,7 @@ def joint_mixups(survey: Survey) -> Iterator[SurveyFinding]:
         best = [min(((axis, 1), (axis, -1)), key=spreads[axis].__getitem__) for axis in (0, 1)]
     given = [spreads[axis][axis, 1] for axis in (0, 1)]
     better = [spreads[axis][best[axis]] for axis in (0, 1)]
-    wrong = [g > STILL_RAD and b < BETTER * g for g, b in zip(given, better, strict=True)]
+    wrong = [g > STILL_RAD and b < 0.6 * g for g, b in zip(given, better, strict=True)]
     if best[0][0] == 1:
         faults = ["pan_rad and tilt_rad are exchanged"] if all(wrong) else []
     else:
