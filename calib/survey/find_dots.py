@@ -7,10 +7,11 @@ cameras are good to 20 cm and 10 degrees, and so is this. Cameras without a roug
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from concurrent.futures import Executor, Future, as_completed
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -48,40 +49,42 @@ def detect_survey(
     The work is done in the executor, e.g. a ``ProcessPoolExecutor`` (its workers must reach the pictures), or
     in this thread; the result does not depend on it. ``progress`` is called after each image, in this thread.
     """
-    wanted = [image for image in survey.images if image.name not in survey.dots and _has_picture(image)]
     expected = expectations(survey)
-    found: dict[str, Dots | CornersNotFound] = {}
-
-    def report(image: str) -> None:
+    tasks = {
+        image.name: (
+            survey.folder / image.file,
+            survey.cameras[image.camera].size_px,
+            survey.board,
+            expected[image.name],
+        )
+        for image in survey.images
+        if image.name not in survey.dots and image.file != Path()
+    }
+    found = dict(survey.dots)
+    failures: dict[str, str] = {}
+    for count, (name, result) in enumerate(_found(tasks, executor), 1):
+        if isinstance(result, Dots):
+            found[name] = result
+        else:
+            failures[name] = result.reason
         if progress is not None:
-            progress(len(found), len(wanted), image)
+            progress(count, len(tasks), name)
+    names = [image.name for image in survey.images]
+    return SurveyDots(
+        {name: found[name] for name in names if name in found},
+        {name: failures[name] for name in names if name in failures},
+    )
 
-    tasks = [
-        (survey.folder / image.file, survey.cameras[image.camera].size_px, survey.board, expected[image.name])
-        for image in wanted
-    ]
+
+def _found(
+    tasks: Mapping[str, tuple[Any, ...]], executor: Executor | None
+) -> Iterator[tuple[str, Dots | CornersNotFound]]:
+    """Yield each image's name and what is found in it, as it comes."""
     if executor is None:
-        for image, task in zip(wanted, tasks, strict=True):
-            found[image.name] = find_in_file(*task)
-            report(image.name)
-    else:
-        futures: dict[Future[Dots | CornersNotFound], str] = {
-            executor.submit(find_in_file, *task): image.name
-            for image, task in zip(wanted, tasks, strict=True)
-        }
-        for future in as_completed(futures):
-            found[futures[future]] = future.result()
-            report(futures[future])
-    dots, failures = {}, {}
-    for image in survey.images:
-        result = found.get(image.name)
-        if image.name in survey.dots:
-            dots[image.name] = survey.dots[image.name]
-        elif isinstance(result, Dots):
-            dots[image.name] = result
-        elif result is not None:
-            failures[image.name] = result.reason
-    return SurveyDots(dots, failures)
+        yield from ((name, find_in_file(*task)) for name, task in tasks.items())
+        return
+    futures = {executor.submit(find_in_file, *task): name for name, task in tasks.items()}
+    yield from ((futures[future], future.result()) for future in as_completed(futures))
 
 
 def find_in_file(
@@ -143,10 +146,6 @@ def expectations(survey: Survey) -> dict[str, PredictedBoard | Upright | None]:
                 _rough_model(camera, C, camera.rough_A, turn, turned), rover_from_board
             )
     return expected
-
-
-def _has_picture(image: SurveyImage) -> bool:
-    return image.file != Path()
 
 
 def _head_turn(image: SurveyImage, camera: SurveyCamera) -> FloatArray:
