@@ -29,7 +29,8 @@ from mastctl.control.publisher import Publisher
 from mastctl.devices.frames import StampedFrame
 from mastctl.packaged import default_config
 from mastctl.recorder import recorder as recorder_module
-from mastctl.recorder.recorder import AttachedMast, Recorder
+from mastctl.recorder.entries import AttachedMast
+from mastctl.recorder.recorder import Recorder
 from mastctl.recorder.repair import repair
 from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.writer import Attached
@@ -64,7 +65,7 @@ def record_until_killed(folder: Path, mast: AttachedMast, seed: int) -> None:
     settings = RecordSettings.model_construct(ring_s=600.0, free_mb=0.0)
     publisher = Publisher()
     about = {"hardware": "simulated"}
-    Recorder(settings, folder, mast, [], about, publisher, _not_kept, lambda _, value: value, clock)
+    Recorder(settings, folder, lambda: mast, [], about, publisher, _not_kept, lambda _, value: value, clock)
     number, next_s = 0, time.monotonic()
     while True:
         number += 1

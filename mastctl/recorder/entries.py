@@ -12,7 +12,7 @@ from mastctl.as_json import as_json
 from mastctl.devices.frames import StampedFrame
 from mastctl.frame_facts import FrameFacts
 from mastctl.recorder import messages
-from mastctl.recorder.writer import RecordFile
+from mastctl.recorder.writer import Attached, RecordFile
 
 SAME_RAD = 1e-6
 REST_S = 10.0
@@ -31,15 +31,22 @@ class Entry:
     time_s: float
 
 
+@dataclass(frozen=True)
+class AttachedMast:
+    """A mast file in use: its rig, and its bytes for the recording."""
+
+    rig: Rig
+    file: Attached
+
+
 class Entries:
     """Writes what was published into a file, and remembers what the next file begins with."""
 
     STICKY = frozenset({"state", "fault", "track", "mast", "lease"})
     """Every file begins with the newest value of each key of these topics."""
 
-    def __init__(self, rig: Rig, digest: str) -> None:
-        self._rig = rig
-        self._digest = digest
+    def __init__(self, mast: AttachedMast) -> None:
+        self.mast = mast
         self._newest: dict[tuple[str, str], Entry] = {}
         self._joints: HeadTold | None = None
         self._joints_written_s = float("-inf")
@@ -47,9 +54,11 @@ class Entries:
         self._frames: dict[str, str] = {}
         self._ended = ""
 
-    def use_mast(self, rig: Rig, digest: str) -> None:
-        """Use another mast file from now on."""
-        self._rig, self._digest = rig, digest
+    def use_mast(self, mast: AttachedMast) -> bool:
+        """Use a mast file from now on; return whether it is another one."""
+        changed = mast.file.digest != self.mast.file.digest
+        self.mast = mast
+        return changed
 
     def begin(self, file: RecordFile, time_s: float) -> None:
         """Write what was known before the file was: cameras, joints, the newest of the sticky topics."""
@@ -64,8 +73,8 @@ class Entries:
     def write_cameras(self, file: RecordFile, time_s: float) -> None:
         """Write every camera's calibration."""
         time_ns = file.clocks.ns(time_s)
-        for name, camera in self._rig.cameras.items():
-            calibration, record = messages.calibration(name, camera, self._digest, time_ns)
+        for name, camera in self.mast.rig.cameras.items():
+            calibration, record = messages.calibration(name, camera, self.mast.file.digest, time_ns)
             file.add_json(f"/camera/{name}/cahvor", "cahvor", record, time_s)
             if calibration is not None:
                 file.add_message(f"/camera/{name}/calibration", calibration, time_s)
@@ -113,7 +122,7 @@ class Entries:
         time_s = self._joints_written_s = reading["measured_s"]
         file.add_json("/joints", "joints", reading, time_s)
         true_rad = reading["true_pan_rad"], reading["true_tilt_rad"]
-        tree = messages.transforms(self._rig, *true_rad, file.clocks.ns(time_s))
+        tree = messages.transforms(self.mast.rig, *true_rad, file.clocks.ns(time_s))
         file.add_message("/tf", tree, time_s)
 
     def _write_frame(self, file: RecordFile, frame: StampedFrame) -> None:

@@ -53,17 +53,7 @@ class Recorded:
 class RecordFolder:
     """The files of one daemon's recordings; used by the recorder's writing thread, read by any.
 
-    Parameters
-    ----------
-    folder
-        Where they lie.
-    clock_s
-        Tells how old segments are; never set back.
-
-    Raises
-    ------
-    OSError
-        From every method, if the disk refuses.
+    ``clock_s``, which is never set back, dates segments. Every method raises OSError if the disk refuses.
     """
 
     def __init__(self, folder: Path, clock_s: Callable[[], float] = time.monotonic) -> None:
@@ -91,22 +81,23 @@ class RecordFolder:
 
     def next_run(self, name: str) -> Path:
         """Return the file of a run that begins now; its name is not taken."""
-        return _untaken(self._runs, f"{_stamp()}{_suffix(name)}", SUFFIX)
+        stem = f"{_stamp()}{_suffix(name)}"
+        names = (stem, *(f"{stem}-{number}" for number in range(2, 1000)))
+        return next(path for one in names if not (path := self._runs / f"{one}{SUFFIX}").exists())
 
     def trim_ring(self, ring_s: float, ring_mb: float) -> None:
         """Let the oldest segments go when the newest one has ended: those that another followed ``ring_s``
-        ago, and what is beyond the ring's size. The newest stays. Those of an earlier daemon count as begun
-        when this one was.
+        ago, and what is beyond the ring's size. The newest stays. Those of an earlier daemon date from the
+        beginning of this one.
         """
-        segments = [(path, path.stat().st_size) for path in _files(self._ring)]
-        begun_s = [self._begun_s.get(path.name, self._opened_s) for path, _ in segments]
+        segments = _files(self._ring)
+        sizes = [path.stat().st_size for path in segments]
+        begun_s = [self._begun_s.get(path.name, self._opened_s) for path in segments]
         too_old_s = self._clock_s() - ring_s
-        while len(segments) > 1 and (
-            sum(size for _, size in segments) > ring_mb * MB or begun_s[1] < too_old_s
-        ):
-            segments.pop(0)[0].unlink(missing_ok=True)
-            begun_s.pop(0)
-        self._begun_s = dict(zip((path.name for path, _ in segments), begun_s, strict=True))
+        while len(segments) > 1 and (sum(sizes) > ring_mb * MB or begun_s[1] < too_old_s):
+            segments.pop(0).unlink(missing_ok=True)
+            del sizes[0], begun_s[0]
+        self._begun_s = {path.name: at_s for path, at_s in zip(segments, begun_s, strict=True)}
 
     def drop_oldest_segment(self) -> bool:
         """Let the ring's oldest segment go; False if there is none beside the newest."""
@@ -192,11 +183,3 @@ def _suffix(text: str) -> str:
     """A text as the end of a file's name."""
     plain = _NOT_IN_NAMES.sub("-", text).strip("-.")[:60]
     return f"-{plain}" if plain else ""
-
-
-def _untaken(folder: Path, name: str, suffix: str) -> Path:
-    path, number = folder / f"{name}{suffix}", 1
-    while path.exists():
-        number += 1
-        path = folder / f"{name}-{number}{suffix}"
-    return path

@@ -14,14 +14,14 @@ import contextlib
 import logging
 import threading
 import time
-from collections import Counter, deque
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any, TypeVar
 
-from calib.geometry.rig import Rig
 from drivers.clock import Clock
 from mastctl.answers import RecorderTold, RecordingDeleted, RecordingEnded, RecordingListed, Recordings
 from mastctl.as_json import readable
@@ -29,7 +29,7 @@ from mastctl.control.publisher import TOPICS, Published, Publisher, Topic
 from mastctl.control.standing import StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError, NotKnown, NotNow, Unable
-from mastctl.recorder.entries import Entries, Entry
+from mastctl.recorder.entries import AttachedMast, Entries, Entry
 from mastctl.recorder.folder import MB, Recorded, RecordFolder
 from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.writer import Attached, Clocks, RecordFile
@@ -52,35 +52,15 @@ WAIT_S = 0.1
 NEXT_RUN = "another run begins"
 
 
-@dataclass(frozen=True)
-class AttachedMast:
-    """A mast file in use: its rig, and its bytes for the recording."""
-
-    rig: Rig
-    file: Attached
-
-
-@dataclass
-class _Now:
-    """What the writing thread is at; its own, read by others."""
-
-    file: RecordFile | None = None
-    run: str | None = None
-    begun_s: float = 0.0
-    fault: StandingFault | None = None
-    retry_s: float = 0.0
-    keep_at_s: float | None = None
-    keep_why: str = ""
-    judged_bytes: int = -1
-
-
 class Recorder:
     """Records what is published, and runs that are begun and ended; safe to use from any thread.
 
     Parameters
     ----------
+    mast
+        Returns the mast file in use.
     others
-        What is attached beside the mast file: the configuration.
+        What is attached beside it: the configuration.
     facts
         Of each file: ``hardware``, its kind; ``version``.
     frame_by_id
@@ -95,7 +75,7 @@ class Recorder:
         self,
         settings: RecordSettings,
         folder: Path,
-        mast: AttachedMast,
+        mast: Callable[[], AttachedMast],
         others: list[Attached],
         facts: dict[str, str],
         publisher: Publisher,
@@ -110,24 +90,25 @@ class Recorder:
         self._clock = clock
         self._frame_by_id = frame_by_id
         self._event_value = event_value
-        self._entries = Entries(mast.rig, mast.file.digest)
-        self._requests: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
-        self._requests_lock = threading.Lock()
+        self._entries = Entries(mast())
+        self._requests: SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = SimpleQueue()
         self._closing = False
         self._dropped: Counter[str] = Counter()
+        # Of the writing thread, read by others
+        self._file: RecordFile | None = None
+        self._run: str | None = None
+        self._fault: StandingFault | None = None
+        self._busy_since_s: tuple[float, float] | None = None
+        self._begun_s = self._retry_s = 0.0
+        self._judged_bytes = -1
+        self._keep: tuple[float, str] | None = None  # when the ring is kept, and why
         self._kept_before: dict[tuple[str, str], float] = {}
         self._standing: set[tuple[str, str]] = set()
-        self._now = _Now()
-        self._busy_since_s: tuple[float, float] | None = None
         self._news = publisher.subscribe(*(TOPICS - NOT_RECORDED), every=True)
         self._thread = threading.Thread(target=self._work, name=NAME, daemon=True)
         self._thread.start()
 
     # For any thread: only requests to the writing thread wait for the disk, and that bounded
-
-    def use_mast(self, mast: AttachedMast) -> None:
-        """Attach another mast file, for what comes from now on."""
-        self._request(lambda: self._use_mast(mast))
 
     def use_settings(self, settings: RecordSettings, others: list[Attached]) -> None:
         """Keep as much as this, in the same folder; attach something else from the next file on."""
@@ -141,16 +122,15 @@ class Recorder:
 
     def summary(self) -> RecorderTold:
         """Return what is recorded now."""
-        now = self._now
-        file = now.file
+        file, fault = self._file, self._fault
         return {
             "recording": file is not None,
             "ring_s": self._ring_s,
-            "run": now.run,
+            "run": self._run,
             "file": None if file is None else file.path.name,
             "size_mb": 0.0 if file is None else file.size_mb,
             "dropped": self._dropped_so_far(),
-            "fault": None if now.fault is None else now.fault.message,
+            "fault": None if fault is None else fault.message,
             "folder": str(self._folder.path),
         }
 
@@ -164,8 +144,8 @@ class Recorder:
 
     def faults(self) -> tuple[StandingFault, ...]:
         """Return what keeps it from recording."""
-        found = [one for one in (self._now.fault,) if one is not None]
-        busy, file = self._busy_since_s, self._now.file
+        found = [one for one in (self._fault,) if one is not None]
+        busy, file = self._busy_since_s, self._file
         waits_s = 0.0 if file is None else file.disk_waits_s
         if busy is None and waits_s > SLOW_S:
             busy = time.monotonic() - waits_s, self._clock.now_s() - waits_s
@@ -182,7 +162,7 @@ class Recorder:
         found = next((path for path in self._found(name).files if readable(path.name) == file), None)
         if found is None:
             raise NotKnown("recording_unknown", f"the recording {name[:80]} has no file {file[:80]}")
-        now = self._now.file
+        now = self._file
         if now is not None and now.path == found:
             raise NotNow("recording", f"{file} is being written; it can be read when that has ended")
         return found
@@ -211,8 +191,7 @@ class Recorder:
 
     def close(self) -> None:
         """Write what was published so far and end the file; bounded. Does nothing the second time."""
-        with self._requests_lock:
-            self._closing = True
+        self._closing = True
         self._news.close()
         self._thread.join(CLOSE_S)
         if self._thread.is_alive():
@@ -221,11 +200,10 @@ class Recorder:
     def _request(self, act: Callable[[], T]) -> Future[T]:
         """Have the writing thread do something."""
         answer: Future[T] = Future()
-        with self._requests_lock:
-            if self._closing:
-                answer.set_exception(Unable("closing", "the service is closing"))
-            else:
-                self._requests.append((act, answer))
+        if self._closing:
+            answer.set_exception(Unable("closing", "the service is closing"))
+        else:
+            self._requests.put((act, answer))
         return answer
 
     def _result(self, act: Callable[[], T]) -> T:
@@ -262,16 +240,13 @@ class Recorder:
     def _work(self) -> None:
         taken_s = time.monotonic()
         while True:
-            with self._requests_lock:
-                closing, requests, self._requests = self._closing, self._requests, deque()
-            news = self._news.wait(0.0 if requests else WAIT_S)
+            closing = self._closing
+            news = self._news.wait(WAIT_S if self._requests.empty() else 0.0)
             since_s, taken_s = taken_s, time.monotonic()  # these values were published between the two
             self._busy_since_s = time.monotonic(), self._clock.now_s()
-            time_s = self._clock.now_s()
-            entries = [entry for one in news if (entry := self._entry(one, time_s)) is not None]
-            self._guarded(lambda: self._write(entries, since_s))  # noqa: B023
-            for act, answer in requests:
-                self._answer(act, answer)
+            self._guarded(lambda: self._write(self._entries_of(news), since_s))  # noqa: B023
+            while not self._requests.empty():
+                self._answer(*self._requests.get())
             self._guarded(self._look_after)
             self._busy_since_s = None
             if closing and not news:
@@ -280,22 +255,24 @@ class Recorder:
             if self._news.closed and not news:
                 time.sleep(WAIT_S)  # the publisher was closed first
 
-    def _entry(self, one: Published, time_s: float) -> Entry | None:
-        """What is recorded of a published value; a value of an unexpected kind must not end the recording."""
-        try:
-            value = one.value if one.topic == "frame" else self._event_value(one.topic, one.value)
-            return Entry(one.topic, one.key, value, time_s)
-        except Exception:
-            self._dropped[one.topic] += 1
-            log.exception("the message %s %s cannot be recorded", one.topic, one.key)
-            return None
+    def _entries_of(self, news: Sequence[Published]) -> list[Entry]:
+        """What is recorded of published values; one of an unexpected kind must not end the recording."""
+        entries, time_s = [], self._clock.now_s()
+        for one in news:
+            try:
+                value = one.value if one.topic == "frame" else self._event_value(one.topic, one.value)
+                entries.append(Entry(one.topic, one.key, value, time_s))
+            except Exception:
+                self._dropped[one.topic] += 1
+                log.exception("the message %s %s cannot be recorded", one.topic, one.key)
+        return entries
 
     def _answer(self, act: Callable[[], Any], answer: Future[Any]) -> None:
         try:
             answer.set_result(act())
         except OSError as error:
             self._failed(error)
-            answer.set_exception(Unable("unwritable", self._now.fault.message if self._now.fault else ""))
+            answer.set_exception(Unable("unwritable", self._fault.message if self._fault else ""))
         except MastctlError as error:
             answer.set_exception(error)
         except Exception as error:  # a defect must not end the thread
@@ -313,32 +290,35 @@ class Recorder:
 
     def _failed(self, error: OSError) -> None:
         """Give the file up, as a killed daemon leaves it, and try another one after a while."""
+        file = self._file
         with contextlib.suppress(OSError):
-            if self._now.file is not None and self._gone(self._now.file):
-                return  # the file went between two looks at the disk, and that is the reason
-        message = f"{self._folder.path} cannot be written: {error.strerror or error}; nothing is recorded"
-        if self._now.run is not None:
-            message += f", and the run {self._now.run} has ended"
-        self._set_fault("unwritable", message, "it can be written again")
-        if self._now.file is not None:
+            if file is not None and self._gone(file):
+                return  # that is the reason
+        reason = f"{self._folder.path} cannot be written: {error.strerror or error}"
+        self._stop_writing("unwritable", reason, "it can be written again", again_s=RETRY_S)
+        if file is not None:
             with contextlib.suppress(OSError):
-                self._now.file.abandon()
-        self._now.file, self._now.run = None, None
-        self._now.retry_s = time.monotonic() + RETRY_S
+                file.abandon()
 
-    def _set_fault(self, code: str, message: str, until: str) -> None:
-        before = self._now.fault
-        since_s = self._clock.now_s() if before is None or before.code != code else before.since_s
-        self._now.fault = StandingFault(NAME, code, message, since_s, until)
-        if before is None or before.code != code:
+    def _stop_writing(self, code: str, reason: str, until: str, again_s: float = 0.0) -> None:
+        """Record nothing until a run begins, or for some seconds, and report the fault."""
+        ended = "nothing is recorded" if self._run is None else f"the run {self._run} has ended"
+        before, message = self._fault, f"{reason}; {ended}"
+        same = before is not None and before.code == code
+        since_s = before.since_s if before is not None and same else self._clock.now_s()
+        self._fault = StandingFault(NAME, code, message, since_s, until)
+        self._file, self._run, self._retry_s = None, None, time.monotonic() + again_s
+        if not same:
             log.error("%s", message)
 
     def _write(self, entries: list[Entry], since_s: float) -> None:
         """Write what was published since a moment into the file, if there is one to be written."""
         for at, one in enumerate(entries):
             try:
+                if one.topic == "mast":
+                    self._use_mast()
                 self._notice_fault(one)
-                file = self._now.file or self._open_ring()
+                file = self._file or self._open_ring()
                 if file is None:
                     self._entries.remember(one)
                     continue
@@ -356,14 +336,13 @@ class Recorder:
             except Exception:  # a value of an unexpected kind must not end the recording
                 self._dropped[one.topic] += 1
                 log.exception("the message %s %s cannot be recorded", one.topic, one.key)
-        if (dropped := self._dropped_so_far()) and self._now.file is not None:
-            self._entries.write_dropped(self._now.file, dropped, self._clock.now_s())
+        if (dropped := self._dropped_so_far()) and self._file is not None:
+            self._entries.write_dropped(self._file, dropped, self._clock.now_s())
 
-    def _use_mast(self, mast: AttachedMast) -> None:
-        self._mast = mast
-        self._entries.use_mast(mast.rig, mast.file.digest)
-        file = self._now.file
-        if file is not None:
+    def _use_mast(self) -> None:
+        """Attach the mast file in use and write its cameras, if it is another one."""
+        mast, file = self._mast(), self._file
+        if self._entries.use_mast(mast) and file is not None:
             time_s, file.published_s = self._clock.now_s(), time.monotonic()
             file.attach(mast.file, file.clocks.ns(time_s))
             self._entries.write_cameras(file, time_s)
@@ -377,30 +356,28 @@ class Recorder:
         new = standing - self._standing
         self._standing = {entry for entry in self._standing if entry[0] != one.key} | standing
         new = {entry for entry in new if now_s - self._kept_before.get(entry, -SAME_FAULT_S) >= SAME_FAULT_S}
-        if new and self._ring_s and self._now.keep_at_s is None:
-            self._now.keep_at_s = now_s + AFTER_FAULT_S
-            self._now.keep_why = "-".join(sorted(new)[0])
+        if new and self._ring_s and self._keep is None:
+            self._keep = now_s + AFTER_FAULT_S, "-".join(sorted(new)[0])
         self._kept_before |= dict.fromkeys(new, now_s)
 
     def _look_after(self) -> None:
         """Flush, go on to the next file, keep the ring after a fault, stay within the bounds."""
-        now, now_s = self._now, time.monotonic()
-        if now.keep_at_s is not None and (now_s >= now.keep_at_s or self._closing):
-            self._keep()
-        file = now.file
+        now_s = time.monotonic()
+        if self._keep is not None and (now_s >= self._keep[0] or self._closing):
+            self._keep_ring(self._keep[1])
+        file = self._file
         if file is None or self._gone(file):
             return
         file.flush_if_due(now_s)
-        if file.size == now.judged_bytes or self._disk_is_low():
+        if file.size == self._judged_bytes or self._disk_is_low():
             return
-        now.judged_bytes = file.size
-        if now.run is not None:
+        self._judged_bytes = file.size
+        if self._run is not None:
             if file.size > self._settings.run_mb * MB:
-                name, mb = now.run, self._settings.run_mb
-                self._end_file()
-                self._set_fault("run_full", f"the run {name} has ended: it has {mb:g} MB", NEXT_RUN)
+                self._stop_writing("run_full", f"the file has {self._settings.run_mb:g} MB", NEXT_RUN)
+                file.finish()
         elif (
-            now_s - now.begun_s > self._ring_s / SEGMENTS
+            now_s - self._begun_s > self._ring_s / SEGMENTS
             or file.size > self._settings.ring_mb * MB / SEGMENTS
         ):
             self._end_file(wait=False)
@@ -410,83 +387,77 @@ class Recorder:
         """End a file that was moved or deleted; return whether it was."""
         if file.in_place:
             return False
-        run, how = self._now.run, f"its file {file.path} was deleted or moved while it was recorded"
-        self._end_file(wait=False)
-        if run is None:
-            log.warning("another segment of the ring begins: %s", how)
+        reason = f"{file.path} was deleted or moved while it was recorded"
+        if self._run is None:
+            log.warning("another segment of the ring begins: %s", reason)
+            self._file = None
         else:
-            self._set_fault("run_gone", f"the run {run} has ended: {how}", NEXT_RUN)
+            self._stop_writing("run_gone", reason, NEXT_RUN)
+        file.finish(wait=False)
         return True
 
-    def _disk_is_low(self) -> bool:
+    def _disk_is_low(self, least: float | None = None) -> bool:
         """End the recording before the disk is full, the ring's oldest first; return whether it was ended."""
-        least = self._settings.free_mb * MB
-        while self._folder.free_bytes() < least:
+        least = self._settings.free_mb * MB if least is None else least
+        while (free := self._folder.free_bytes()) < least:
             if self._folder.drop_oldest_segment():
                 continue
-            free_mb = self._folder.free_bytes() / MB
-            run = "" if self._now.run is None else f", and the run {self._now.run} has ended"
-            message = (
-                f"the disk of {self._folder.path} has {free_mb:.0f} MB free where "
-                f"{self._settings.free_mb:g} MB are left to others; nothing is recorded{run}"
+            reason = (
+                f"the disk of {self._folder.path} has {free / MB:.0f} MB free where "
+                f"{self._settings.free_mb:g} MB are left to others"
             )
-            self._end_file()
-            self._set_fault("disk_low", message, "the disk has more space")
-            self._now.retry_s = time.monotonic() + RETRY_S
+            file = self._file
+            self._stop_writing("disk_low", reason, "the disk has more space", again_s=RETRY_S)
+            if file is not None:
+                file.finish()
             return True
         return False
 
-    def _keep(self) -> None:
+    def _keep_ring(self, why: str) -> None:
         """Move the ring's segments out of its way, the newest too."""
-        now = self._now
-        now.keep_at_s = None
-        if now.run is None:
+        self._keep = None
+        if self._run is None:
             self._end_file()
-        if name := self._folder.keep_ring(now.keep_why, self._settings.kept_mb):
+        if name := self._folder.keep_ring(why, self._settings.kept_mb):
             log.warning("the recording around a fault is kept: %s", name)
 
     def _open_ring(self) -> RecordFile | None:
         """Open the ring's next segment, if there is to be one now."""
-        if not self._ring_s or time.monotonic() < self._now.retry_s:
+        if not self._ring_s or time.monotonic() < self._retry_s:
             return None
         return self._open(self._folder.next_segment, None)
 
     def _open(self, path: Callable[[], Path], run: str | None) -> RecordFile | None:
         """Open a file and write what was known last; None if the disk is low."""
-        now = self._now
         self._folder.prepare()
-        factor = RESUME_FREE if now.fault is not None and now.fault.code == "disk_low" else 1.0
-        least = factor * self._settings.free_mb * MB
-        if self._folder.free_bytes() < least:
-            self._disk_is_low()
-            now.retry_s = time.monotonic() + RETRY_S
-            if self._folder.free_bytes() < least:
-                return None
+        factor = RESUME_FREE if self._fault is not None and self._fault.code == "disk_low" else 1.0
+        if self._disk_is_low(factor * self._settings.free_mb * MB):
+            return None
         clocks = Clocks(self._clock.now_s(), time.time_ns())
         facts = self._facts | ({} if run is None else {"run": run})
-        now.file = RecordFile(path(), [self._mast.file, *self._others], facts, clocks)
-        now.begun_s, now.run = time.monotonic(), run
-        if run is not None or (now.fault is not None and now.fault.until != NEXT_RUN):
-            now.fault = None
-        now.file.published_s = time.monotonic()
-        self._entries.begin(now.file, self._clock.now_s())
-        return now.file
+        mast = self._entries.mast
+        file = self._file = RecordFile(path(), [mast.file, *self._others], facts, clocks)
+        self._begun_s, self._run = time.monotonic(), run
+        if run is not None or (self._fault is not None and self._fault.until != NEXT_RUN):
+            self._fault = None
+        file.published_s = time.monotonic()
+        self._entries.begin(file, self._clock.now_s())
+        return file
 
     def _end_file(self, *, wait: bool = True) -> None:
         """End the file that is written, if there is one; no run is recorded then."""
-        file, self._now.file, self._now.run = self._now.file, None, None
+        file, self._file, self._run = self._file, None, None
         if file is not None:
             file.finish(wait=wait)
 
     def _start_run(self, name: str) -> RecorderTold:
-        if self._now.run is not None:
-            raise NotNow("recording", f"the run {self._now.run} is recorded already; end it first")
+        if self._run is not None:
+            raise NotNow("recording", f"the run {self._run} is recorded already; end it first")
         self._end_file()
         self._folder.prepare()
         path = self._folder.next_run(name)
         if not self._open(lambda: path, path.stem):
-            fault = self._now.fault
-            raise Unable("disk_low", "the disk is full" if fault is None else fault.message)
+            raise Unable("disk_low", "the disk is full" if self._fault is None else self._fault.message)
         log.info("run %s is recorded", path.stem)
         return self.summary()
 
@@ -495,7 +466,7 @@ class Recorder:
         if one.kind == "ring":
             message = "the ring is overwritten by itself; record.ring_s in the configuration says when"
             raise NotNow("recording", message)
-        if name == self._now.run:
+        if name == self._run:
             raise NotNow("recording", f"the run {name} is recorded; end it first")
         try:
             self._folder.delete(one)
@@ -505,14 +476,12 @@ class Recorder:
         return {"recordings": self._recordings()}
 
     def _stop_run(self) -> RecordingEnded:
-        file, run = self._now.file, self._now.run
+        file, run = self._file, self._run
         if file is None or run is None:
             raise NotNow("not_recording", "no run is recorded; 'record start' begins one")
         if self._gone(file):
-            assert self._now.fault is not None
-            raise Unable("run_gone", self._now.fault.message)
+            raise Unable("run_gone", "" if self._fault is None else self._fault.message)
         self._end_file()
         log.info("run %s has ended", run)
-        dropped = self._dropped_so_far()
         size_mb = file.path.stat().st_size / MB
-        return {"run": run, "file": str(file.path), "size_mb": size_mb, "dropped": dropped}
+        return {"run": run, "file": str(file.path), "size_mb": size_mb, "dropped": self._dropped_so_far()}

@@ -40,7 +40,8 @@ from mastctl.motion.pairs import in_picture
 from mastctl.motion.requests import wrong_camera
 from mastctl.motion.track import ACTIVE, RoverPose, TrackStatus
 from mastctl.motion.tracker import Tracker
-from mastctl.recorder.recorder import AttachedMast, Recorder
+from mastctl.recorder.entries import AttachedMast
+from mastctl.recorder.recorder import Recorder
 from mastctl.recorder.writer import Attached
 from mastctl.safety import heads, stop_socket
 from mastctl.safety.latch import Latch
@@ -165,7 +166,7 @@ class Service:
         self.recorder = Recorder(
             config.record,
             config.record.folder or self.folder.path / RECORDS_FOLDER,
-            _attached(mast),
+            lambda: _attached(self.masts.in_use),
             [Attached(config.path.name, config.data)],
             {"hardware": hardware.kind, "version": self._version},
             publisher,
@@ -461,7 +462,6 @@ class Service:
         self.tracker.use_rig(rig, mast.path.name)
         self.handoffs.use_mast(stored.digest)
         self.health.use_mast(stored)
-        self.recorder.use_mast(_attached(mast))
 
     def _steered(self, control: WhoSteers | None) -> None:
         """Publish who holds the lease."""

@@ -19,7 +19,8 @@ from mastctl.control.publisher import Publisher, Topic
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.errors import NotKnown
-from mastctl.recorder.recorder import AttachedMast, Recorder
+from mastctl.recorder.entries import AttachedMast
+from mastctl.recorder.recorder import Recorder
 from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.writer import Attached
 from mastctl.service.state import event_value
@@ -65,11 +66,11 @@ class Recording:
     """A recorder, and the publisher that it reads."""
 
     def __init__(self, folder: Path, **settings: Any) -> None:
-        self.publisher = Publisher()
+        self.publisher, self.mast = Publisher(), mast()
         wanted = RecordSettings.model_construct(**{"ring_s": 600.0, "free_mb": 0.0} | settings)
         facts, clock = {"hardware": "simulated"}, SystemClock()
         self.recorder = Recorder(
-            wanted, folder, mast(), [CONFIG], facts, self.publisher, _gone, as_published, clock
+            wanted, folder, lambda: self.mast, [CONFIG], facts, self.publisher, _gone, as_published, clock
         )
         self.publish, self.summary = self.publisher.publish, self.recorder.summary
 

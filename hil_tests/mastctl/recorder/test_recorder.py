@@ -33,9 +33,8 @@ from mastctl.control import publisher
 from mastctl.control.standing import StandingFault
 from mastctl.errors import NotNow, Unable
 from mastctl.recorder import recorder as module
-from mastctl.recorder.entries import Entries
+from mastctl.recorder.entries import AttachedMast, Entries
 from mastctl.recorder.folder import RecordFolder
-from mastctl.recorder.recorder import AttachedMast
 from mastctl.recorder.writer import Attached, RecordFile
 
 FAULT = StandingFault("pan_tilt", "no_reply", "it does not answer", 1.0, "it answers")
@@ -330,9 +329,9 @@ def test_a_run_whose_file_goes_is_a_fault_until_the_next_one(
     one.publish("command", "2", {"number": 2})
     until(lambda: one.summary()["recording"] is (ring_s > 0.0), "the ring goes on")
     (fault,) = one.recorder.faults()
-    words = f"the run {run} has ended: its file {path} was deleted or moved while it was recorded"
-    assert (fault.code, fault.message, fault.until) == ("run_gone", words, "another run begins")
-    assert one.summary()["fault"] == words and one.summary()["run"] is None
+    message = f"{path} was deleted or moved while it was recorded; the run {run} has ended"
+    assert (fault.code, fault.message, fault.until) == ("run_gone", message, "another run begins")
+    assert one.summary()["fault"] == message and one.summary()["run"] is None
     with pytest.raises(NotNow, match="no run is recorded"):
         one.recorder.stop_run()
     one.recorder.start_run("again")
@@ -348,7 +347,8 @@ def test_another_mast_file_is_attached_and_its_cameras_told_when_it_comes(tmp_pa
     one.publish("joints", "pan_tilt", reading(0.1))
     one.written()
     other = Attached("other.yaml", b"another mast file")
-    one.recorder.use_mast(AttachedMast(mast().rig, other))
+    one.mast = AttachedMast(mast().rig, other)
+    one.publish("mast", "in_use", {"file": "other.yaml", "name": "other", "digest": other.digest})
     one.publish("joints", "pan_tilt", reading(0.2))
     one.recorder.close()
     (path,) = files(tmp_path)

@@ -21,8 +21,9 @@ from mastctl.client import Client
 from mastctl.config import Listen, load_config
 from mastctl.control.publisher import Publisher
 from mastctl.daemon import RunningDaemon
+from mastctl.recorder.entries import AttachedMast
 from mastctl.recorder.recorded import Recording, read_whole
-from mastctl.recorder.recorder import AttachedMast, Recorder
+from mastctl.recorder.recorder import Recorder
 from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.what_if import WouldBe, pointings_with, rms, seen_in
 from mastctl.recorder.writer import Attached
@@ -60,7 +61,15 @@ def recorded(mast_file: Path, true_file: Path, folder: Path) -> Path:
         facts = {"hardware": "simulated"}
         find = service.devices.frame_by_id
         recorder = Recorder(
-            settings, folder, mast, attached, facts, publisher, find, service.event_value, service.clock
+            settings,
+            folder,
+            lambda: mast,
+            attached,
+            facts,
+            publisher,
+            find,
+            service.event_value,
+            service.clock,
         )
         recorder.start_run("")
         for x_px, y_px in CLICKS_PX:
