@@ -187,9 +187,7 @@ class CameraFeeds:
             try:
                 before = made
                 made = await self._in_thread(lambda: self._next(camera, before))  # noqa: B023
-                for viewer in self._of(camera):
-                    if viewer.ready(camera):
-                        await self._hand_to(viewer, made)
+                await self._hand_out(camera, made)
                 pause_s = AGAIN_S if made is before else 0.0
             except (DriverError, MastctlError) as error:  # its fault says more
                 log.debug("no picture of %s for its viewers: %s", camera, error)
@@ -211,19 +209,20 @@ class CameraFeeds:
             return before
         return Picture(frame, frame.jpeg or encoded(frame.image, "jpeg", JPEG_QUALITY))
 
-    async def _hand_to(self, viewer: Viewer, made: Picture) -> None:
-        """Hand a picture to a viewer, which may click it from then on."""
-        frame, most_bytes = made.frame, viewer.most_bytes[made.frame.camera]
+    async def _hand_out(self, camera: str, made: Picture) -> None:
+        """Hand a picture to each viewer that is ready, which may click it from then on."""
+        ready = [one for one in self._of(camera) if one.ready(camera)]
 
-        def prepared() -> Picture:
-            self._cameras.hold(frame, viewer.name, viewer.kept_of(frame))
-            return made.within(most_bytes)
+        def prepared() -> list[Picture]:
+            for viewer in ready:
+                self._cameras.hold(made.frame, viewer.name, viewer.kept_of(made.frame))
+            return [made.within(viewer.most_bytes[camera]) for viewer in ready]
 
-        picture = await self._in_thread(prepared)
-        if viewer in self._viewers:
-            viewer.put(picture)
-        else:  # it left before the frame was kept for it, which would be kept for ever
-            self._cameras.let_go(viewer.name)
+        for viewer, picture in zip(ready, await self._in_thread(prepared), strict=True):
+            if viewer in self._viewers:
+                viewer.put(picture)
+            else:  # it left before the frame was kept for it, which would be kept for ever
+                self._cameras.let_go(viewer.name)
 
     async def _wanted(self, camera: str) -> bool:
         """Wait until a viewer is ready for a picture; False if there is no viewer any more."""
