@@ -82,18 +82,8 @@ class Turned:
 class Evidence:
     """What some pointings say against the mast file.
 
-    Attributes
-    ----------
-    count, since_s
-        How many pointings, and when the first one was.
-    times
-        As how many times as wrong as expected everything confirmed is, rms.
-    log_evidence
-        Natural logarithm of the averaged ratio.
-    log_wider
-        Of the part that says that everything is some times as wrong.
-    turned
-        By camera.
+    ``times``: how many times as wrong as expected everything confirmed is, rms; ``log_evidence``: natural
+    logarithm of the averaged ratio, ``log_wider`` of its part that everything is some times as wrong.
     """
 
     count: int
@@ -113,15 +103,7 @@ def sums_of(one: Expected, off_px: Sequence[float], time_s: float) -> Sums:
 
 
 class Judge:
-    """Weighs sums of pointings against one mast file.
-
-    Parameters
-    ----------
-    covariance
-        (p, p) of the mast file's parameters.
-    cameras
-        (c,) whose turns the sums tell.
-    """
+    """Weighs sums of pointings against one mast file, of (p, p) covariance, for turns of (c,) cameras."""
 
     def __init__(self, covariance: FloatArray, cameras: tuple[str, ...]) -> None:
         values, vectors = np.linalg.eigh(covariance)
@@ -137,13 +119,8 @@ class Judge:
     def weigh(self, sums: Sums, confirmed: Sums | None = None) -> Evidence:
         """Return what pointings say.
 
-        Parameters
-        ----------
-        sums
-            All of them.
-        confirmed
-            Those of them that are no false matches for sure, all by default: only they can say that
-            everything is wider. A turn has to account for all.
+        ``confirmed``: those of them that are no false matches for sure, all by default: only they can say
+        that everything is wider. A turn has to account for all.
         """
         normal, square, right = self._reduced(sums)
         count, first_s, turned = sums.count, sums.first_s, {}

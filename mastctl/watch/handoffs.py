@@ -156,12 +156,7 @@ def read_log(path: str | Path) -> ReadLog:
     """Read a record of hand-offs.
 
     A last line without its end that is no JSON is what a crash left, and is passed over. A recording (MCAP)
-    is one too: its topic ``/handoff`` holds the lines.
-
-    Raises
-    ------
-    BadFile
-        If the file cannot be read or a line is no hand-off: which line, which key, what is expected.
+    is one too: its topic ``/handoff`` holds the lines. Raises BadFile with line and key.
     """
     data = _lines_recorded(Path(path)) if is_mcap(Path(path)) else read_bytes(path, MAX_BYTES)
     lines = data.split(b"\n")
@@ -205,22 +200,13 @@ def handoff_of(path: str | Path, number: int, value: Any) -> MatchedHandoff:
 
 NAME = "handoff_log"
 KEPT = 2000
-"""Newest hand-offs that count, and that wait for a file that cannot be written."""
+"""Newest hand-offs that count."""
 
 
 class HandoffCheck:
     """The offsets that hand-offs show with the mast file in use; safe from any thread, waits for no file.
 
-    Parameters
-    ----------
-    path
-        The log, read at the start and appended to; None: earlier hand-offs are not known.
-    digest
-        Of the mast file in use.
-    clock
-        Dates the faults.
-    thread
-        Reads and writes the log.
+    The log at ``path`` is read at the start and appended to; None: earlier hand-offs are not known.
     """
 
     def __init__(self, path: Path | None, digest: str, clock: Clock, thread: JournalThread) -> None:
@@ -229,7 +215,6 @@ class HandoffCheck:
         self._thread = thread
         self._lock = threading.Lock()
         self._handoffs: deque[MatchedHandoff] = deque(maxlen=KEPT)
-        self._unwritten: deque[MatchedHandoff] = deque(maxlen=KEPT)
         self._digest = digest
         self._judged: tuple[int, tuple[HandoffBias, ...]] = (0, ())  # how many count, the offsets
         self._fault: StandingFault | None = None
@@ -285,21 +270,12 @@ class HandoffCheck:
         self._judge(join)
 
     def _write(self, handoff: MatchedHandoff) -> None:
-        """Log what waits, oldest first, as far as it goes."""
         assert self._journal is not None
-        self._unwritten.append(handoff)
-        try:
-            while self._unwritten:
-                try:
-                    self._journal.append(self._unwritten[0])
-                except ValueError as error:
-                    log.error("a hand-off cannot be logged: %s", error)
-                self._unwritten.popleft()
-        except BadFile as error:
-            message = f"{' '.join(str(error).split())}; hand-offs count, and wait to be logged"
-            if self._fault is None:
+        reason, before = self._journal.keep(handoff), self._fault
+        self._fault = None
+        if reason:
+            message = f"{reason}; hand-offs count, and wait to be logged"
+            if before is None:
                 log.error("%s", message)
-            since_s = self._clock.now_s() if self._fault is None else self._fault.since_s
+            since_s = self._clock.now_s() if before is None else before.since_s
             self._fault = StandingFault(NAME, "unwritable", message, since_s, "a hand-off is logged")
-        else:
-            self._fault = None

@@ -6,6 +6,7 @@ import json
 import logging
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -20,6 +21,7 @@ from mastctl.json_lines import OtherFile, append_line, read_lines
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 
+MOST_WAITING = 2000
 NEWEST_BYTES = 16_000_000
 """So much of a file without a bound is read, its newest part."""
 NAME = "drift_watch"
@@ -55,15 +57,10 @@ class Journal(Generic[T]):
         self._to_json, self._from_json = to_json, from_json
         self._begins = begins
         self._most_bytes = most_bytes
+        self._waiting: deque[T] = deque(maxlen=MOST_WAITING)
 
     def read(self) -> list[T]:
-        """Return the records, oldest first; lines that are none are left out, and logged.
-
-        Raises
-        ------
-        BadFile
-            If the file system refuses.
-        """
+        """Return the records, oldest first; lines that are none are left out, and logged. Raises BadFile."""
         try:
             lines = read_lines(self.path, 2 * self._most_bytes if self._most_bytes else NEWEST_BYTES)
         except OSError as error:
@@ -79,28 +76,40 @@ class Journal(Generic[T]):
             log.warning("%s: %d of %d lines are no %s", self.path, left_out, len(lines), self._what)
         return records
 
-    def append(self, record: T, counting: Sequence[T] = ()) -> None:
+    def append(self, record: T, counting: Sequence[T] = ()) -> bool:
         """Add a record; it is on the disk, whole, when this returns.
 
         What a crash has left of a line at the end of the file is taken away first. At its bound the file is
-        written anew with ``counting``, which has the record too.
-
-        Raises
-        ------
-        BadFile
-            If the file system refuses, or the file holds something else.
-        ValueError
-            If a number is not finite.
+        written anew with ``counting``, which has the record too; returns whether it was. Raises BadFile,
+        ValueError for a number that is not finite.
         """
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            if not append_line(self.path, self._line(record), self._most_bytes, self._begins):
+            appended = append_line(self.path, self._line(record), self._most_bytes, self._begins)
+            if not appended:
                 replace_bytes(self.path, b"".join(map(self._line, counting)))
+            return not appended
         except OtherFile:
             message = f"holds no {self._what}; a new or another file is expected"
             raise BadFile(self.path, "", message) from None
         except OSError as error:
             raise BadFile(self.path, "", f"cannot be written: {error.strerror or error}") from None
+
+    def keep(self, record: T, counting: Sequence[T] = ()) -> str:
+        """Append a record and those that wait, oldest first; return why some still wait, empty if none."""
+        self._waiting.append(record)
+        try:
+            while self._waiting:
+                try:
+                    if self.append(self._waiting[0], counting):
+                        self._waiting.clear()
+                        break
+                except ValueError as error:
+                    log.error("%s: a record cannot be kept: %s", self.path, error)
+                self._waiting.popleft()
+        except BadFile as error:
+            return " ".join(str(error).split())
+        return ""
 
     def _line(self, record: T) -> bytes:
         return (json.dumps(self._to_json(record), allow_nan=False) + "\n").encode()
@@ -109,13 +118,8 @@ class Journal(Generic[T]):
 class JournalThread:
     """Does what may have to wait for a file, one after the other.
 
-    Parameters
-    ----------
-    clock
-        Dates the fault.
-    file_time
-        Measures how long a file does not answer; the machine's own clock by default: a file is real, also
-        beside a simulation.
+    ``clock`` dates the fault; ``file_time``, the machine's own clock, measures how long a file does not
+    answer: a file is real, also beside a simulation.
     """
 
     def __init__(self, clock: Clock, file_time: Clock | None = None) -> None:

@@ -68,20 +68,14 @@ def is_idle(client: Client, for_s: float = 0.0) -> str:
 
 def take_pictures(
     client: Client,
-    rests: Sequence[tuple[float, float]],
+    rests: Sequence[Sequence[float]],
     cameras: Sequence[str],
     progress: Callable[[int, int], None] | None = None,
 ) -> Taken:
     """Return a picture of each camera at each rest (pan, tilt as read), and bring the head back.
 
-    The client should hold the lease. A camera that gives no image is left out; the others go on.
-
-    Raises
-    ------
-    LookEnded
-        If the head is stopped.
-    ClientError
-        If the daemon refuses, or no camera gives a picture.
+    The client should hold the lease. A camera that gives no image is left out; the others go on. Raises
+    LookEnded if the head is stopped, ClientError if no camera gives a picture.
     """
     joints = client.status()["joints"]
     taken, left = Taken(), list(cameras)
@@ -139,14 +133,8 @@ def look_again(
 ) -> SceneDrift:
     """Take the pictures of a reference again and return what has changed.
 
-    Nothing moves before it is known that the reference can be compared with.
-
-    Raises
-    ------
-    LookEnded
-        If another mast file or other cameras are in use than at the reference, or the head is stopped.
-    BadFile
-        If a picture of the reference is damaged.
+    Nothing moves before it is known that the reference can be compared with. Raises LookEnded if another mast
+    file or other cameras are in use, or the head is stopped, BadFile for a damaged picture.
     """
     if client.status()["mast"]["digest"] != reference.mast_digest:
         raise LookEnded("another mast file is in use than when the reference was taken; take a new one")
@@ -177,15 +165,7 @@ def compared(
 
 
 def view_shifts(rig: Rig, reference: Reference, pictures: Sequence[ReferencePicture]) -> list[ViewShift]:
-    """Return how far the features of a reference have moved in new pictures.
-
-    Raises
-    ------
-    BadFile
-        If a picture of the reference is damaged.
-    LookEnded
-        If the new pictures are of another size.
-    """
+    """Return how far the features of a reference have moved in new pictures. Raises BadFile, LookEnded."""
     shifts = []
     for now in pictures:
         then = reference.picture(now.camera, now.pose)
@@ -243,13 +223,7 @@ def is_due(reference: Reference, last_look: str | None, every_s: float, now: dat
 
 
 def look_idle(client: Client, reference: Reference) -> SceneDrift:
-    """Look under a lease, which ends with a stop of the head.
-
-    Raises
-    ------
-    LookEnded
-        If another client took over or stopped the head; as `look_again` else.
-    """
+    """Look under a lease, which ends with a stop of the head. Raises LookEnded."""
     with client.lease(NAME, for_s=LEASE_S, ends_with_stop=True):
         try:
             return look_again(client, reference)
@@ -272,23 +246,9 @@ def watch(
 ) -> None:
     """Look whenever it is due and the head is idle, until interrupted.
 
-    Parameters
-    ----------
-    folder
-        With a reference.
-    connect
-        To the daemon.
-    tell, looked
-        Get why there is no look though one is due, each reason once; and each look.
-    every_s
-        From look to look, seconds, counted from the reference's time on.
-    idle_s
-        So long the head must not have been used.
-
-    Raises
-    ------
-    BadFile
-        If there is no reference at the start. What fails later is reported, and tried again.
+    ``tell`` gets why there is no look though one is due, each reason once; ``looked`` gets each look. They
+    come every ``every_s`` seconds from the reference's time on, where the head was not used for ``idle_s``.
+    Raises BadFile if there is no reference at the start; what fails later is reported, and tried again.
     """
     read_reference(folder)
     said = ""

@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import cv2
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from calib.calibrate.drift import SceneDrift
 from calib.errors import BadFile
@@ -24,7 +24,7 @@ from calib.files.records import Moment, Record, Text, problem, read_record
 from calib.matching.warp import Grey, grey
 from mastctl.watch.journal import Journal
 
-SCHEMA = "mastctl/sentinel/1"
+SCHEMA: Literal["mastctl/sentinel/1"] = "mastctl/sentinel/1"
 SENTINEL_FOLDER = "sentinel"
 """In a daemon's state folder, where its status reads it."""
 
@@ -46,25 +46,6 @@ class PictureRecord(Record):
     sha256: Text
 
 
-class ReferenceRecord(Record):
-    """A `reference.json`."""
-
-    schema_: Literal["mastctl/sentinel/1"] = Field(alias="schema")
-    time: Moment
-    mast_digest: Text
-    rests: list[Annotated[list[_Angle], Field(min_length=2, max_length=2)]]
-    pictures: list[PictureRecord]
-
-    @model_validator(mode="after")
-    def _has_a_rest_for_each_picture(self) -> ReferenceRecord:
-        most = len(self.rests) - 1
-        for at, one in enumerate(self.pictures):
-            if one.pose > most:
-                reason = f"{one.pose} where an integer from 0 to {most} is expected"
-                raise problem(f"pictures[{at}].pose", reason)
-        return self
-
-
 @dataclass(frozen=True, eq=False)
 class ReferencePicture:
     """A camera's picture at a rest: true joint angles, and the mast file that they follow from."""
@@ -77,15 +58,24 @@ class ReferencePicture:
     image: Grey
 
 
-@dataclass(frozen=True)
-class Reference:
+class Reference(Record):
     """A folder's reference: when it was taken, with which mast file, at which rests; its pictures."""
 
-    time: str
-    mast_digest: str
-    rests: tuple[tuple[float, float], ...]
-    pictures: tuple[PictureRecord, ...]
-    folder: Path
+    schema_: Literal["mastctl/sentinel/1"] = Field(alias="schema")
+    time: Moment
+    mast_digest: Text
+    rests: list[Annotated[list[_Angle], Field(min_length=2, max_length=2)]]
+    pictures: list[PictureRecord]
+    _folder: Path = PrivateAttr(default=Path())
+
+    @model_validator(mode="after")
+    def _has_a_rest_for_each_picture(self) -> Self:
+        most = len(self.rests) - 1
+        for at, one in enumerate(self.pictures):
+            if one.pose > most:
+                reason = f"{one.pose} where an integer from 0 to {most} is expected"
+                raise problem(f"pictures[{at}].pose", reason)
+        return self
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -101,7 +91,7 @@ class Reference:
         """Return a picture, None if the reference has none of this camera there. Raises BadFile."""
         for one in self.pictures:
             if (one.camera, one.pose) == (camera, pose):
-                path = self.folder / one.file
+                path = self._folder / one.file
                 data = read_bytes(path, MOST_PICTURE_BYTES)
                 whole = hashlib.sha256(data).hexdigest() == one.sha256
                 image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE) if whole else None
@@ -118,23 +108,21 @@ def save_reference(
 ) -> Reference:
     """Save reference pictures in place of any before, and forget the looks at those.
 
-    A reference counts from its ``reference.json`` on, which is written last.
-
-    Raises
-    ------
-    BadFile
-        If the file system refuses.
+    A reference counts from its ``reference.json`` on, which is written last. Raises BadFile.
     """
     inner = None
     try:
         folder.mkdir(parents=True, exist_ok=True)
         inner = Path(tempfile.mkdtemp(prefix="pictures-", dir=folder))
-        told = [_saved(folder, inner, one) for one in pictures]
-        document = {
-            "schema": SCHEMA, "time": time, "mast_digest": pictures[0].mast_digest,
-            "rests": [list(rest) for rest in rests], "pictures": told,
-        }  # fmt: skip
-        replace_bytes(folder / REFERENCE, json.dumps(document, indent=1).encode(), 0o644)
+        reference = Reference(
+            schema=SCHEMA,
+            time=time,
+            mast_digest=pictures[0].mast_digest,
+            rests=[list(rest) for rest in rests],
+            pictures=[_saved(folder, inner, one) for one in pictures],
+        )
+        document = reference.model_dump_json(by_alias=True, indent=1)
+        replace_bytes(folder / REFERENCE, document.encode(), 0o644)
     except OSError as error:
         if inner is not None:
             shutil.rmtree(inner, ignore_errors=True)  # the former reference still counts
@@ -146,27 +134,25 @@ def save_reference(
     return read_reference(folder)
 
 
-def _saved(folder: Path, inner: Path, one: ReferencePicture) -> dict[str, Any]:
+def _saved(folder: Path, inner: Path, one: ReferencePicture) -> PictureRecord:
     """Write a picture; what the reference says of it. Raises OSError."""
     done, png = cv2.imencode(".png", np.clip(np.rint(one.image), 0, 255).astype(np.uint8))
     if not done:
         raise OSError(None, f"{one.camera}'s picture cannot be written as PNG")
     path = inner / f"{one.pose}-{one.camera}.png"
     path.write_bytes(png.tobytes())
-    return {
-        "camera": one.camera, "pose": one.pose, "pan_rad": one.pan_rad, "tilt_rad": one.tilt_rad,
-        "file": str(path.relative_to(folder)), "sha256": hashlib.sha256(png.tobytes()).hexdigest(),
-    }  # fmt: skip
+    return PictureRecord(
+        camera=one.camera,
+        pose=one.pose,
+        pan_rad=one.pan_rad,
+        tilt_rad=one.tilt_rad,
+        file=str(path.relative_to(folder)),
+        sha256=hashlib.sha256(png.tobytes()).hexdigest(),
+    )
 
 
 def read_reference(folder: Path) -> Reference:
-    """Read a folder's reference.
-
-    Raises
-    ------
-    BadFile
-        If there is none, or it is damaged.
-    """
+    """Read a folder's reference. Raises BadFile if there is none, or it is damaged."""
     path = folder / REFERENCE
     if not path.is_file():
         raise BadFile(folder, "", "holds no reference; take one: mastctl rig sentinel reference")
@@ -174,9 +160,9 @@ def read_reference(folder: Path) -> Reference:
         document = json.loads(read_bytes(path, MOST_BYTES))
     except (ValueError, RecursionError):
         raise BadFile(path, "", "is no JSON; take the reference again") from None
-    record = read_record(ReferenceRecord, document, path)
-    rests = tuple((pan_rad, tilt_rad) for pan_rad, tilt_rad in record.rests)
-    return Reference(record.time, record.mast_digest, rests, tuple(record.pictures), folder)
+    reference = read_record(Reference, document, path)
+    reference._folder = folder
+    return reference
 
 
 def add_look(folder: Path, reference: Reference, time: str, drift: SceneDrift) -> dict[str, Any]:
@@ -212,10 +198,7 @@ def look_line(reference: Reference, time: str, drift: SceneDrift) -> dict[str, A
 def read_looks(folder: Path, reference: Reference) -> list[dict[str, Any]]:
     """Return the looks at a reference, oldest first; lines that were cut or spoiled are left out.
 
-    Raises
-    ------
-    BadFile
-        If there is a file of looks that cannot be read.
+    Raises BadFile if there is a file of looks that cannot be read.
     """
     return [look for look in look_journal(folder).read() if look.get("reference") == reference.time]
 

@@ -62,15 +62,7 @@ class Judged:
 class Windows:
     """The pointings with one mast file; used by one thread.
 
-    Parameters
-    ----------
-    rig, mast_digest
-        The mast file.
-
-    Raises
-    ------
-    CalibError
-        If it has no covariance, or one that is none: then nothing can be expected of it.
+    Raises CalibError if it has no covariance, or one that is none: then nothing can be expected of it.
     """
 
     def __init__(self, rig: Rig, mast_digest: str) -> None:
@@ -242,16 +234,8 @@ SHOWN = 50
 class CalibrationHealth:
     """The verdict of residuals on the mast file in use; safe to use from any thread, waits for no file.
 
-    Parameters
-    ----------
-    folder
-        Where the pointings of the last days are kept.
-    mast
-        The mast file in use.
-    thread
-        Reads and writes them, and judges.
-    wall_s
-        The time of day, seconds since 1970: pointings of a week ago may be from before a restart.
+    ``folder`` keeps the pointings of the last days; ``wall_s`` is the time of day, seconds since 1970, as
+    pointings of a week ago may be from before a restart.
     """
 
     def __init__(
@@ -342,11 +326,6 @@ class CalibrationHealth:
     def _keep(self, one: Measured) -> None:
         """Write a pointing to the journal; a failure is logged once."""
         counting = [kept for kept in self._known if kept["time_s"] > self._wall_s() - DAYS * DAY_S]
-        try:
-            self._journal.append(one, counting)
-        except BadFile as error:
-            if not self._not_kept:
-                log.error("%s; pointings count, and are not kept over a restart", error)
-            self._not_kept = str(error)
-        else:
-            self._not_kept = ""
+        before, self._not_kept = self._not_kept, self._journal.keep(one, counting)
+        if self._not_kept and not before:
+            log.error("%s; pointings count, and are not kept over a restart", self._not_kept)

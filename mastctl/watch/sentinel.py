@@ -138,17 +138,7 @@ RENEWED_S = 60.0
 
 
 class SentinelFindings:
-    """What the looks in a folder say, as of a few seconds ago; reading it waits for nothing.
-
-    Parameters
-    ----------
-    folder
-        Where a sentinel keeps its reference and looks; need not exist.
-    mast_digest
-        Returns that of the mast file in use.
-    thread
-        Reads it every few seconds.
-    """
+    """What the looks in a folder say, as of a few seconds ago; reading it waits for nothing."""
 
     def __init__(self, folder: Path, mast_digest: Callable[[], str], thread: JournalThread) -> None:
         self._folder = folder

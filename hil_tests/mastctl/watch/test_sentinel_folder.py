@@ -32,7 +32,11 @@ MOVED = "the images moved by up to 1.80 px, 9 sigma"
 RESTS = [(0.0, -0.2), (0.5, -0.2)]
 
 
-REFERENCE_OF_A_WEEK = Reference((NOW - timedelta(days=7)).isoformat(), "d" * 64, (), (), Path())
+def reference_of(time: str) -> Reference:
+    return Reference(schema="mastctl/sentinel/1", time=time, mast_digest="d" * 64, rests=[], pictures=[])
+
+
+REFERENCE_OF_A_WEEK = reference_of((NOW - timedelta(days=7)).isoformat())
 
 
 def pictures() -> list[ReferencePicture]:
@@ -140,14 +144,14 @@ def test_two_looks_must_see_a_change_before_it_is_reported(
 
 
 def test_a_clock_that_was_set_back_does_not_stop_the_looks() -> None:
-    reference = Reference((NOW + timedelta(days=3)).isoformat(), "d" * 64, (), (), Path())
+    reference = reference_of((NOW + timedelta(days=3)).isoformat())
     assert "at a time 3 days ahead of this clock" in standing(reference, [], NOW)["sentence"]
     assert is_due(reference, (NOW + timedelta(days=3, hours=1)).isoformat(), 86400.0, NOW)
     assert not is_due(reference, NOW.isoformat(), 86400.0, NOW + timedelta(minutes=1))
 
 
 def test_a_look_is_due_at_the_references_time_of_day() -> None:
-    reference = Reference("2026-05-01T09:30:00+00:00", "d" * 64, (), (), Path())
+    reference = reference_of("2026-05-01T09:30:00+00:00")
     morning = datetime(2026, 5, 3, 9, 29, tzinfo=UTC)
     yesterday = "2026-05-02T09:31:00+00:00"
     assert not is_due(reference, yesterday, 86400.0, morning)
