@@ -89,8 +89,8 @@ def answers_checked() -> Iterator[list[str]]:
     complaints: list[str] = []
     plain: Callable[..., ASGIApp] = daemon_module.create_app  # type: ignore[attr-defined]
 
-    def create_app(*args: Any, **options: Any) -> ASGIApp:
-        app, known = plain(*args, **options), described()
+    def create_app(parts: Any) -> ASGIApp:
+        app, known = plain(parts), described()
 
         async def watched(scope: Scope, receive: Receive, send: Send) -> None:
             status, kind, body = 0, "", bytearray()

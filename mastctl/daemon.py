@@ -42,6 +42,7 @@ from mastctl.safety.stop_threads import StopsHang
 from mastctl.service.service import Service
 from mastctl.service_manager import Heartbeat, ServiceManager
 from mastctl.web.app import create_app
+from mastctl.web.parts import Parts
 from mastctl.web.pictures import CameraFeeds
 
 log = logging.getLogger(__name__)
@@ -264,7 +265,7 @@ async def _serve(
     streams = Streams(service.machine.publisher)
     feeds = CameraFeeds(service.devices, service.clock)
     silent = SilentConnections()
-    app = silent.around(create_app(service, waiting, entrance, streams, feeds))
+    app = silent.around(create_app(Parts(service, waiting, streams, entrance, feeds)))
     server = uvicorn.Server(_settings(app))
     ending = asyncio.Event()
 

@@ -15,15 +15,10 @@ POLL_S = 0.02
 
 
 class Jog:
-    """The head under the hand of this program; made by `mastctl.client.Client.jog`. A context manager.
+    """The head under the control of this program; made by `mastctl.client.Client.jog`. A context manager.
 
     While the block runs, heartbeats go out by themselves with the rates that were set last. At its end, and
     half a second after this process hangs or dies, the head stops.
-
-    Parameters
-    ----------
-    connect
-        Makes a connection of its own.
     """
 
     def __init__(self, connect: Callable[[], DaemonHttp]) -> None:
@@ -45,11 +40,8 @@ class Jog:
     def rates(self, pan_rad_per_s: float, tilt_rad_per_s: float) -> None:
         """Turn at these rates from now on; both zero stops the head.
 
-        Raises
-        ------
-        ClientError
-            If the daemon has refused a heartbeat since: ``jog_ended`` where it had missed them for too long,
-            ``busy``, ``no_daemon``. The head stops then by itself.
+        Raises ClientError if the daemon has refused a heartbeat since: ``jog_ended`` where it had missed them
+        for too long, ``busy``, ``no_daemon``. The head stops then by itself.
         """
         with self._changed:
             if self._error is not None:

@@ -103,11 +103,6 @@ class KeepingCalls:
             of each camera. By default 0.2 and 60, or as the run had them.
         by_hand
             Whether a simulated board waits for `board_stands` too, as a real one does.
-
-        Raises
-        ------
-        ClientError
-            ``bench_runs``, ``bench_done``, ``bench_unknown``, ``bad_board``, ``unwritable``, ``disk_low``.
         """
         body = given(
             board=board,
@@ -203,12 +198,8 @@ class KeepingCalls:
     ) -> SunTold:
         """Say where the sun stands: azimuth from north over east (forward over right), elevation up.
 
-        Parameters
-        ----------
-        half_angle_rad
-            How near a head camera's axis may come.
-        valid_s
-            How long that holds, seconds; left out, until another is stated.
+        ``half_angle_rad``: how near a head camera's axis may come; ``valid_s``: how long that holds, seconds,
+        by default until another is stated.
         """
         body = given(
             azimuth_rad=azimuth_rad,

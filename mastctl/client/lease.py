@@ -18,12 +18,7 @@ LEAST_TIMEOUT_S = 0.5
 class HeldLease:
     """The right to steer, as long as no other client takes over; `LeaseCalls.lease` makes one.
 
-    Attributes
-    ----------
-    id, holder
-        As the daemon gave them.
-    lost
-        Why the lease is no longer held, None while it is; the next command is refused with the same reason.
+    ``lost``: why the lease is over, None while it lasts; the next command is refused with the same reason.
     """
 
     def __init__(self, daemon: DaemonHttp, granted: LeaseGranted, for_s: float) -> None:
@@ -80,7 +75,8 @@ class LeaseCalls:
     ) -> Iterator[HeldLease]:
         """Steer alone inside the block: a thread renews the lease, and this client's commands carry it.
 
-        A motion that still runs when the lease ends, by the block's end too, is stopped: wait for it.
+        A motion that still runs when the lease ends, by the block's end too, is stopped: wait for it. Raises
+        ClientError ``leased`` if another client steers.
 
         Parameters
         ----------
@@ -93,16 +89,6 @@ class LeaseCalls:
         ends_with_stop
             Whether it ends with the next stop of the head: for a program that would go on with its next move
             otherwise.
-
-        Yields
-        ------
-        lease
-            Whose ``lost`` says if another client took over meanwhile.
-
-        Raises
-        ------
-        ClientError
-            ``leased`` if another client steers.
         """
         granted = self.acquire_lease(name, for_s, take_over, ends_with_stop)
         before, held = self.daemon.lease_id, HeldLease(self.daemon, granted, for_s)

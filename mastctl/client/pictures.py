@@ -45,10 +45,7 @@ class LivePictures:
     def next(self, timeout_s: float) -> LivePicture | None:
         """Return the next picture, None if there was none for so many seconds.
 
-        Raises
-        ------
-        ClientError
-            ``no_daemon`` if the line broke, or the daemon has ended; ``bad_answer`` for what is no picture.
+        Raises ClientError ``no_daemon`` if the line broke or the daemon has ended, ``bad_answer``.
         """
         try:
             message = self._line.recv(timeout=timeout_s)
@@ -69,10 +66,7 @@ class LivePictures:
 def live_pictures(daemon: DaemonHttp, cameras: Sequence[str]) -> Iterator[LivePictures]:
     """Open a line of pictures of some cameras, at their own rate.
 
-    Raises
-    ------
-    ClientError
-        ``no_daemon`` if no daemon answers; ``refused`` if the daemon does not send them, with its reason.
+    Raises ClientError ``no_daemon``; ``refused`` if the daemon does not send them, with its reason.
     """
     path = daemon.socket_path
     base = "http://localhost" if path is not None else daemon.url.rstrip("/")

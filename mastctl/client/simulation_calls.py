@@ -66,11 +66,6 @@ class SimulationCalls:
             rover_from_board (w, x, y, z) instead of that.
         bow_m
             How far its middle stands out, across and down; left out: as before, flat at first.
-
-        Raises
-        ------
-        ClientError
-            ``not_simulated``, ``bad_options``, ``bad_board``.
         """
         body = given(
             position_m=floats(position_m),
@@ -90,13 +85,9 @@ class SimulationCalls:
         return self.daemon.json(TimeTold, "GET", "/simulation/time")
 
     def advance(self, duration_s: float) -> TimeTold:
-        """Let time pass for a simulated rover whose ``simulation.speed`` is ``max``; return it as
-        `simulation_time` does.
+        """Let time pass for a simulated rover whose ``simulation.speed`` is ``max``; return it then.
 
-        Raises
-        ------
-        ClientError
-            ``time_passes`` where time passes by itself, ``not_simulated``.
+        Raises ClientError ``time_passes`` where time passes by itself.
         """
         return self.daemon.command(TimeTold, "POST", "/simulation/time", {"advance_s": duration_s})
 
@@ -109,16 +100,9 @@ class SimulationCalls:
     ) -> TruthTold:
         """Return what a pixel (x, y) of a frame truly shows, or where a point of the site truly lies in it.
 
-        Returns
-        -------
-        answer
-            ``position_in_site_m``, ``position_m`` in the rover frame when the frame was taken, ``pixel_px``;
-            null where the camera could not see it, all where a pixel shows the sky.
-
-        Raises
-        ------
-        ClientError
-            ``not_simulated``; ``frame_too_old`` and such for a frame that is not kept.
+        ``position_m`` is in the rover frame when the frame was taken; ``pixel_px`` null where the camera
+        could not see it, all three where a pixel shows the sky. Raises ClientError ``frame_too_old`` and
+        such.
         """
         query: dict[str, Any] = {"frame_id": frame_id}
         if pixel is not None:

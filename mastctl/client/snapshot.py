@@ -24,12 +24,8 @@ class Snapshot(FrameFacts):
     def image(self) -> NDArray[np.uint8]:
         """The decoded picture, uint8 of (h, w) or (h, w, 3) in the order blue, green, red.
 
-        Raises
-        ------
-        ImportError
-            If OpenCV is missing, as the distribution ``mastctl-client`` leaves it to you.
-        ValueError
-            If the picture cannot be decoded.
+        Raises ImportError without OpenCV, which ``mastctl-client`` leaves to you, ValueError if it cannot be
+        decoded.
         """
         try:
             import cv2
@@ -54,13 +50,7 @@ class Snapshot(FrameFacts):
 
 
 def read_snapshot(data: bytes, told: Mapping[str, str]) -> Snapshot:
-    """Return a picture from a file's bytes and the headers that came with it.
-
-    Raises
-    ------
-    ValueError
-        If a fact is missing or wrong.
-    """
+    """Return a picture from a file's bytes and the headers that came with it. Raises ValueError."""
     try:
         return Snapshot(data=data, **facts_in(told))
     except (KeyError, ValueError) as reason:

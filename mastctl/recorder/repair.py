@@ -29,11 +29,8 @@ class Repaired:
 def repair(sources: Sequence[Path], out: Path) -> Repaired:
     """Write all that is whole in some files, in their order, into one; the sources stay as they are.
 
-    Raises
-    ------
-    BadRecording
-        If a source cannot be read, none of them holds a recording, or ``out`` is there already or cannot be
-        written; a half-written ``out`` is taken away.
+    Raises BadRecording if a source cannot be read, none of them holds a recording, or ``out`` is there
+    already or cannot be written; a half-written ``out`` is taken away.
     """
     try:
         with out.open("xb") as file:

@@ -61,26 +61,10 @@ class Clocks:
 class RecordFile:
     """An MCAP file that grows. Not for several threads at once.
 
-    Parameters
-    ----------
-    path
-        Made; it must not exist yet.
-    attached
-        Mast file and configuration, written first.
-    facts
-        Of the recording: metadata ``mastctl``.
-    clocks
-        Stamps the messages.
-
-    Attributes
-    ----------
-    published_s
-        When the messages that are added now were published, by `time.monotonic`.
-
-    Raises
-    ------
-    OSError
-        From every method, if the file cannot be written. Then it is as a killed daemon leaves it.
+    ``path`` must not exist yet; ``attached``, mast file and configuration, and ``facts``, the metadata
+    ``mastctl``, are written first; ``clocks`` stamp the messages. ``published_s``: when the messages that are
+    added now were published, by `time.monotonic`. Every method raises OSError if the file cannot be written;
+    then it is as a killed daemon leaves it.
     """
 
     def __init__(

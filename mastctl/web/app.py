@@ -18,56 +18,29 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from typing_extensions import get_type_hints, is_typeddict
 
 from mastctl.answers import ErrorBody
-from mastctl.http.entrance import EntryRules
 from mastctl.http.guard import Guard
 from mastctl.http.refusals import JsonAnswer, add_errors
-from mastctl.http.waiting import Streams, Waiting
-from mastctl.service.service import Service
 from mastctl.web import described
 from mastctl.web.events import add_events
 from mastctl.web.images import add_cameras, add_images
 from mastctl.web.keeping import add_bench, add_masts, add_places, add_recordings
 from mastctl.web.page import add_page, add_site, text_answer
 from mastctl.web.parts import Here, Parts
-from mastctl.web.pictures import CameraFeeds
 from mastctl.web.sessions import add_sessions
 from mastctl.web.simulation import add_simulation
 from mastctl.web.steering import add_estop, add_lease, add_limits, add_pointing, add_tracking
 from mastctl.web.watching import add_watching
 
 
-def create_app(
-    service: Service,
-    waiting: Waiting | None = None,
-    entrance: EntryRules | None = None,
-    streams: Streams | None = None,
-    feeds: CameraFeeds | None = None,
-) -> ASGIApp:
-    """Return the ASGI application that serves one service.
-
-    Parameters
-    ----------
-    waiting
-        Tells its requests when the daemon ends.
-    entrance
-        What it asks of who comes in; nothing but a loopback name by default.
-    streams
-        Ends who listens to events when the daemon ends.
-    feeds
-        Pictures of cameras that have viewers.
-    """
-    waiting = waiting or Waiting(service.clock)
-    entrance = entrance or EntryRules()
-    streams = streams or Streams(service.machine.publisher)
-    feeds = feeds or CameraFeeds(service.devices, service.clock)
-    parts = Parts(service, waiting, streams, entrance, feeds)
+def create_app(parts: Parts) -> ASGIApp:
+    """Return the ASGI application that serves one service."""
     routes = api()
 
     async def served(scope: Scope, receive: Receive, send: Send) -> None:
         scope.setdefault("state", {})["parts"] = parts
         await routes(scope, receive, send)
 
-    return Guard(served, entrance, service.entry, waiting.turn)
+    return Guard(served, parts.entrance, parts.service.entry, parts.waiting.turn)
 
 
 class _Read(Request):

@@ -19,20 +19,8 @@ from mastctl.web.pictures import CameraFeeds
 
 @dataclass(frozen=True)
 class Parts:
-    """What serves one daemon's requests.
-
-    Attributes
-    ----------
-    service
-        What the daemon holds.
-    waiting
-        Runs what may wait.
-    streams
-        Who listens to events.
-    entrance
-        What is asked of who comes in.
-    feeds
-        Pictures of cameras that have viewers.
+    """What serves one daemon's requests: what runs work that may wait, the listeners of events, the rules for
+    clients, and the pictures of cameras that have viewers.
     """
 
     service: Service

@@ -80,16 +80,9 @@ class Picture:
 
 
 class Viewer:
-    """One client's view of some cameras; `CameraFeeds.viewer` makes one.
+    """One client's view of some cameras, ``every`` at their own rate; `CameraFeeds.viewer` makes one.
 
-    Attributes
-    ----------
-    every
-        Whether at the cameras' own rate.
-    news
-        Set when a picture came.
-    most_bytes
-        Of each camera's next picture; None: any number.
+    ``news`` is set when a picture came; ``most_bytes`` bounds each camera's next picture.
     """
 
     def __init__(self, name: str, cameras: Sequence[str], ready: bool, every: bool) -> None:
@@ -130,13 +123,7 @@ class Viewer:
 
 
 class CameraFeeds:
-    """Pictures of cameras for as long as they have viewers; for the event loop.
-
-    Parameters
-    ----------
-    cameras, clock
-        The daemon's.
-    """
+    """Pictures of cameras for as long as they have viewers; for the event loop."""
 
     def __init__(self, cameras: LiveCameras, clock: Clock) -> None:
         self._cameras = cameras
@@ -151,12 +138,8 @@ class CameraFeeds:
     def viewer(self, cameras: Sequence[str], ready: bool = True, every: bool = False) -> Iterator[Viewer]:
         """View some configured cameras inside the block.
 
-        Parameters
-        ----------
-        ready
-            Whether a first picture of each is wanted before `Viewer.want`.
-        every
-            Whether pictures are wanted at the cameras' own rate, and not only as a person sees them move.
+        ``ready``: whether a first picture of each is wanted before `Viewer.want`; ``every``: whether pictures
+        are wanted at the cameras' own rate, and not only as a person sees them move.
         """
         viewer = Viewer(f"viewer {next(self._numbers)}", cameras, ready, every)
         self._viewers.add(viewer)
