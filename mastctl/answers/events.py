@@ -7,9 +7,9 @@ from typing import Literal, NotRequired
 from typing_extensions import TypedDict
 
 from mastctl.answers.bench import BenchRunRecord
+from mastctl.answers.kinds import Count, Json, Role, Seconds
 from mastctl.answers.motion import OperationTold, TrackTold
 from mastctl.answers.status import FaultTold, LeaseTold, MastTold, MeasuredJoints, StandingTold
-from mastctl.answers.words import Count, Json, Role, Seconds
 
 
 class HeadTold(MeasuredJoints):

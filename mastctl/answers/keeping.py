@@ -7,13 +7,13 @@ from typing import Annotated, Any, Literal
 from annotated_types import Ge, Gt, Len
 from typing_extensions import TypedDict
 
+from mastctl.answers.kinds import Angles, Count, Pixel, Point, Role, Seconds
 from mastctl.answers.status import CalibrationTold, MastTold, SentinelTold
-from mastctl.answers.words import Angles, Count, Pixel, Point, Role, Seconds
 
 RecordingKind = Literal["run", "kept", "ring"]
 
 
-class CameraMountTold(TypedDict):
+class CameraMount(TypedDict):
     """A configured camera: where it looks, by its frame's axes, and how much it sees.
 
     ``azimuth_rad`` (to the right), ``elevation_rad`` (up) of the optical axis; ``width_rad``, ``height_rad``
@@ -31,7 +31,7 @@ class CameraMountTold(TypedDict):
     partner: str | None
 
 
-class RigTold(TypedDict):
+class RigSummary(TypedDict):
     """``GET /rig``: the configured cameras by the mast file in use, its date, its neighbours.
 
     ``mast_date`` as the file's provenance says it; ``modified_s``: of the file, seconds since 1970 (UTC).
@@ -40,11 +40,11 @@ class RigTold(TypedDict):
     digest: str
     mast_date: str | None
     modified_s: float | None
-    cameras: dict[str, CameraMountTold]
+    cameras: dict[str, CameraMount]
     mast_files: list[str]
 
 
-class TurnedTold(TypedDict):
+class CameraTurn(TypedDict):
     """How far a camera seems turned, by the axes of the frame that it is mounted on."""
 
     turn_rad: Point
@@ -79,7 +79,7 @@ class MeasuredPointing(TypedDict):
     count_rad: Annotated[list[Annotated[float, Ge(0.0)]], Len(2, 2)]
 
 
-class MeasuredTold(MeasuredPointing):
+class CountedPointing(MeasuredPointing):
     """A pointing that counts: ``sigma_px`` of all that is expected, ``chi_square`` of ``off_px`` over that (2
     on average)."""
 
@@ -87,7 +87,7 @@ class MeasuredTold(MeasuredPointing):
     chi_square: float
 
 
-class ResidualsTold(CalibrationTold):
+class ResidualVerdict(CalibrationTold):
     """The verdict of residuals alone, with its figures.
 
     ``times_expected``: residuals over what is expected, rms, all that is common taken out.
@@ -97,15 +97,15 @@ class ResidualsTold(CalibrationTold):
     log10_evidence: float | None
     log10_threshold: float
     false_alarms_per_day: float
-    cameras: dict[str, TurnedTold]
+    cameras: dict[str, CameraTurn]
 
 
-class CalibrationHealthTold(ResidualsTold):
+class CalibrationReport(ResidualVerdict):
     """``GET /calibration/health``: the verdict, its figures, the newest pointings that count, and the result
     of the drift sentinel's looks."""
 
     write_error: str | None
-    newest: list[MeasuredTold]
+    newest: list[CountedPointing]
     sentinel: SentinelTold | None
 
 
@@ -119,7 +119,7 @@ class RecordingListed(TypedDict):
     names: list[str]
 
 
-class RecorderTold(TypedDict):
+class RecorderState(TypedDict):
     """What is recorded now. ``dropped``: messages not written, by topic; ``fault``: what is wrong."""
 
     recording: bool
@@ -136,7 +136,7 @@ class Recordings(TypedDict):
     """``GET /recordings``; ``free_mb``: of the disk, 10⁶ bytes, null if it does not say."""
 
     recordings: list[RecordingListed]
-    recorder: RecorderTold
+    recorder: RecorderState
     free_mb: float | None
 
 
@@ -155,27 +155,27 @@ class RecordingEnded(TypedDict):
     dropped: dict[str, Count]
 
 
-class PlaceTold(TypedDict):
+class HeadPlace(TypedDict):
     """A place of the head, radians as it reads them."""
 
     pan_rad: float
     tilt_rad: float
 
 
-class PlacesTold(TypedDict):
+class PlaceList(TypedDict):
     """The places that are kept, by name; ``home`` is always among them."""
 
-    places: dict[str, PlaceTold]
+    places: dict[str, HeadPlace]
 
 
-class MastsTold(TypedDict):
+class MastChange(TypedDict):
     """``POST /mast``: the mast file in use, and the one before it."""
 
     mast: MastTold
     former_mast: MastTold | None
 
 
-class ChangeTold(TypedDict):
+class ConfigChange(TypedDict):
     """A difference of two configurations: the key, its former and its present value; null where absent."""
 
     key: str
@@ -183,15 +183,15 @@ class ChangeTold(TypedDict):
     after: Any
 
 
-class ReloadTold(TypedDict):
+class ReloadResult(TypedDict):
     """``POST /reload``: what changed, the mast file in use, and sentences that say what to know of it."""
 
-    changed: list[ChangeTold]
+    changed: list[ConfigChange]
     mast: MastTold
     notes: list[str]
 
 
-class SessionTold(TypedDict):
+class ClientSession(TypedDict):
     """``GET /session``: the client, its rights, and the way it came.
 
     ``needs_token``: whether the daemon requires one at all.

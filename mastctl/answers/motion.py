@@ -7,8 +7,7 @@ from typing import Annotated, Literal, NotRequired
 from annotated_types import Len
 from typing_extensions import TypedDict
 
-from mastctl.answers.status import EstopHeld, PoseTold
-from mastctl.answers.words import (
+from mastctl.answers.kinds import (
     Angles,
     Count,
     ErrorTold,
@@ -20,6 +19,7 @@ from mastctl.answers.words import (
     Seconds,
     TrackState,
 )
+from mastctl.answers.status import EstopHeld, PoseTold
 
 
 class StepTold(TypedDict):

@@ -7,17 +7,17 @@ from typing import Annotated, Any, Literal
 from annotated_types import Len
 from typing_extensions import TypedDict
 
-from mastctl.answers.words import Pixel, Point, Quaternion
+from mastctl.answers.kinds import Pixel, Point, Quaternion
 
 
-class StandTold(TypedDict):
+class TruePose(TypedDict):
     """Where a simulated rover truly stands."""
 
     position_m: Point
     quaternion: Quaternion
 
 
-class BoardStands(TypedDict):
+class BoardPose(TypedDict):
     """A board before a simulated rover: what it is, and rover_from_board."""
 
     board: dict[str, Any]
@@ -26,13 +26,13 @@ class BoardStands(TypedDict):
     bow_m: Annotated[list[float], Len(2, 2)]
 
 
-class BoardsTold(TypedDict):
+class BoardList(TypedDict):
     """The boards before a simulated rover, by name."""
 
-    boards: dict[str, BoardStands]
+    boards: dict[str, BoardPose]
 
 
-class TimeTold(TypedDict):
+class SimulationTime(TypedDict):
     """A simulated rover's time, seconds, and its speed, where it has one."""
 
     now_s: float
@@ -55,7 +55,7 @@ class FaultsSet(TypedDict):
     faults: list[FaultSet]
 
 
-class ParameterTold(TypedDict):
+class FaultParameter(TypedDict):
     """A parameter of a fault word: its default and its bounds; null for one without an end."""
 
     default: float | None
@@ -63,20 +63,20 @@ class ParameterTold(TypedDict):
     most: float | None
 
 
-class WordTold(TypedDict):
+class FaultWord(TypedDict):
     """A fault word: its effect, in one sentence, and its parameters; the unit is in the name."""
 
     effect: str
-    parameters: dict[str, ParameterTold]
+    parameters: dict[str, FaultParameter]
 
 
-class WordsTold(TypedDict):
+class FaultWordList(TypedDict):
     """The fault words of each simulated device."""
 
-    devices: dict[str, dict[str, WordTold]]
+    devices: dict[str, dict[str, FaultWord]]
 
 
-class TruthTold(TypedDict):
+class PointTruth(TypedDict):
     """Where a point of the simulated scene truly is: in the site, in the rover frame of a frame, and in it.
 
     ``pixel_px`` is null where the camera could not see it, all three where the pixel shows the sky.

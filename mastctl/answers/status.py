@@ -7,7 +7,7 @@ from typing import Annotated, Literal, NotRequired
 from annotated_types import Len
 from typing_extensions import TypedDict
 
-from mastctl.answers.words import Angles, Count, Json, Pixel, Point, Quaternion, Seconds, TrackState, Word
+from mastctl.answers.kinds import Angles, Count, Json, Pixel, Point, Quaternion, Seconds, TrackState, Word
 
 
 class LiveTold(TypedDict):

@@ -8,21 +8,21 @@ from mastctl.answers import (
     BenchAnswer,
     BenchRunRecord,
     BenchRuns,
-    CalibrationHealthTold,
+    CalibrationReport,
     CameraSettingsTold,
+    ClientSession,
+    HeadPlace,
     LiveTold,
-    MastsTold,
-    PlacesTold,
-    PlaceTold,
-    RecorderTold,
+    MastChange,
+    PlaceList,
+    RecorderState,
     RecordingDeleted,
     RecordingEnded,
     Recordings,
-    ReloadTold,
+    ReloadResult,
     ReportList,
-    RigTold,
+    RigSummary,
     SentinelTold,
-    SessionTold,
     SunTold,
 )
 from mastctl.client.connection import DaemonHttp, escaped, given
@@ -33,27 +33,27 @@ class KeepingCalls:
 
     daemon: DaemonHttp
 
-    def reload(self) -> ReloadTold:
+    def reload(self) -> ReloadResult:
         """Have the daemon read its configuration again: all of it comes into use while the head rests, or
         nothing (``restart_needed``, ``bad_config``, ``bad_mast_file``, ``busy``, ``moving``).
         """
-        return self.daemon.command(ReloadTold, "POST", "/reload")
+        return self.daemon.command(ReloadResult, "POST", "/reload")
 
     def live(self) -> LiveTold:
         """Return that the daemon answers; needs no token."""
         return self.daemon.json(LiveTold, "GET", "/health/live")
 
-    def calibration_health(self) -> CalibrationHealthTold:
+    def calibration_health(self) -> CalibrationReport:
         """Return whether residuals of the last days are as the mast file predicts, with the figures."""
-        return self.daemon.json(CalibrationHealthTold, "GET", "/calibration/health")
+        return self.daemon.json(CalibrationReport, "GET", "/calibration/health")
 
     def sentinel(self) -> SentinelTold:
         """Return what the drift sentinel in the daemon's state folder has found, and how long ago."""
         return self.daemon.json(SentinelTold, "GET", "/sentinel")
 
-    def rig(self) -> RigTold:
+    def rig(self) -> RigSummary:
         """Return the configured cameras by the mast file in use: where each looks and how much it sees."""
-        return self.daemon.json(RigTold, "GET", "/rig")
+        return self.daemon.json(RigSummary, "GET", "/rig")
 
     def camera_settings(self, camera: str) -> CameraSettingsTold:
         """Return what of a camera can be changed: ``settings`` with bounds, and whether they are ``held``."""
@@ -141,9 +141,9 @@ class KeepingCalls:
         """Return the daemon's recordings, and what it records now."""
         return self.daemon.json(Recordings, "GET", "/recordings")
 
-    def start_recording(self, name: str = "") -> RecorderTold:
+    def start_recording(self, name: str = "") -> RecorderState:
         """Have the daemon record until `stop_recording`; return what it records then."""
-        return self.daemon.command(RecorderTold, "POST", "/recordings/start", {"name": name})
+        return self.daemon.command(RecorderState, "POST", "/recordings/start", {"name": name})
 
     def stop_recording(self) -> RecordingEnded:
         """End the recording; return its file on the daemon's machine, its size and what was dropped."""
@@ -162,26 +162,26 @@ class KeepingCalls:
         """Return the mast file that the daemon uses, byte for byte."""
         return self.daemon.request("GET", "/mast").content
 
-    def use_mast(self, file: str) -> MastsTold:
+    def use_mast(self, file: str) -> MastChange:
         """Use another mast file of the same folder; return which is in use now, and the former one."""
-        return self.daemon.command(MastsTold, "POST", "/mast", {"file": file})
+        return self.daemon.command(MastChange, "POST", "/mast", {"file": file})
 
-    def use_former_mast(self) -> MastsTold:
+    def use_former_mast(self) -> MastChange:
         """Go back to the mast file that was in use before; return which is in use now, and the former one."""
-        return self.daemon.command(MastsTold, "POST", "/mast/back")
+        return self.daemon.command(MastChange, "POST", "/mast/back")
 
-    def places(self) -> dict[str, PlaceTold]:
+    def places(self) -> dict[str, HeadPlace]:
         """Return the places of the head that are kept, by name; ``home`` is always among them."""
-        return self.daemon.json(PlacesTold, "GET", "/places")["places"]
+        return self.daemon.json(PlaceList, "GET", "/places")["places"]
 
-    def keep_place(self, name: str, pan_rad: float, tilt_rad: float) -> dict[str, PlaceTold]:
+    def keep_place(self, name: str, pan_rad: float, tilt_rad: float) -> dict[str, HeadPlace]:
         """Keep a place of the head by a name, for everybody; return all."""
         body = {"pan_rad": pan_rad, "tilt_rad": tilt_rad}
-        return self.daemon.command(PlacesTold, "POST", f"/places/{escaped(name)}", body)["places"]
+        return self.daemon.command(PlaceList, "POST", f"/places/{escaped(name)}", body)["places"]
 
-    def forget_place(self, name: str) -> dict[str, PlaceTold]:
+    def forget_place(self, name: str) -> dict[str, HeadPlace]:
         """Forget a place; return those that are left. Raises ClientError ``place_unknown``."""
-        return self.daemon.command(PlacesTold, "DELETE", f"/places/{escaped(name)}")["places"]
+        return self.daemon.command(PlaceList, "DELETE", f"/places/{escaped(name)}")["places"]
 
     def sun(self) -> SunTold:
         """Return the direction that no head camera looks into: ``sun``, null where none was stated."""
@@ -214,6 +214,6 @@ class KeepingCalls:
         """Keep the head off no sun any more."""
         return self.daemon.command(SunTold, "DELETE", "/limits/sun")
 
-    def session(self) -> SessionTold:
+    def session(self) -> ClientSession:
         """Return this client's ``name``, ``role`` and ``via``, and whether the daemon requires a token."""
-        return self.daemon.json(SessionTold, "GET", "/session")
+        return self.daemon.json(ClientSession, "GET", "/session")

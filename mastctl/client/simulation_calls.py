@@ -6,15 +6,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mastctl.answers import (
-    BoardStands,
-    BoardsTold,
+    BoardList,
+    BoardPose,
     FaultSet,
     FaultsSet,
-    StandTold,
-    TimeTold,
-    TruthTold,
-    WordsTold,
-    WordTold,
+    FaultWord,
+    FaultWordList,
+    PointTruth,
+    SimulationTime,
+    TruePose,
 )
 from mastctl.client.connection import DaemonHttp, escaped, floats, given
 
@@ -24,23 +24,23 @@ class SimulationCalls:
 
     daemon: DaemonHttp
 
-    def true_pose(self) -> StandTold:
+    def true_pose(self) -> TruePose:
         """Return where a simulated rover truly stands: ``position_m`` and ``quaternion``, site_from_rover."""
-        return self.daemon.json(StandTold, "GET", "/simulation/pose")
+        return self.daemon.json(TruePose, "GET", "/simulation/pose")
 
     def stand(
         self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
-    ) -> StandTold:
+    ) -> TruePose:
         """Put a simulated rover somewhere on its ground, truly; return its true pose."""
         body = {"x_m": x_m, "y_m": y_m, "heading_rad": heading_rad}
         body |= {"pitch_rad": pitch_rad, "roll_rad": roll_rad}
-        return self.daemon.command(StandTold, "POST", "/simulation/pose", body)
+        return self.daemon.command(TruePose, "POST", "/simulation/pose", body)
 
-    def boards(self) -> dict[str, BoardStands]:
+    def boards(self) -> dict[str, BoardPose]:
         """Return the boards held up before a simulated rover, by name: ``board``, ``position_m``,
         ``quaternion`` (rover_from_board), ``bow_m``.
         """
-        return self.daemon.json(BoardsTold, "GET", "/simulation/boards")["boards"]
+        return self.daemon.json(BoardList, "GET", "/simulation/boards")["boards"]
 
     def put_board(
         self,
@@ -50,7 +50,7 @@ class SimulationCalls:
         turned_rad: Sequence[float] | None = None,
         quaternion: Sequence[float] | None = None,
         bow_m: Sequence[float] | None = None,
-    ) -> BoardStands:
+    ) -> BoardPose:
         """Hold a board up before a simulated rover, or move it; frames exposed from now on show it there.
 
         Parameters
@@ -74,22 +74,22 @@ class SimulationCalls:
             quaternion=None if quaternion is None else floats(quaternion),
             bow_m=None if bow_m is None else floats(bow_m),
         )
-        return self.daemon.command(BoardStands, "POST", f"/simulation/boards/{escaped(name)}", body)
+        return self.daemon.command(BoardPose, "POST", f"/simulation/boards/{escaped(name)}", body)
 
     def take_board(self, name: str) -> None:
         """Take a board away from a simulated rover."""
-        self.daemon.command(BoardsTold, "DELETE", f"/simulation/boards/{escaped(name)}")
+        self.daemon.command(BoardList, "DELETE", f"/simulation/boards/{escaped(name)}")
 
-    def simulation_time(self) -> TimeTold:
+    def simulation_time(self) -> SimulationTime:
         """Return a simulated rover's time: ``now_s``, and ``speed``, a number or ``max``."""
-        return self.daemon.json(TimeTold, "GET", "/simulation/time")
+        return self.daemon.json(SimulationTime, "GET", "/simulation/time")
 
-    def advance(self, duration_s: float) -> TimeTold:
+    def advance(self, duration_s: float) -> SimulationTime:
         """Let time pass for a simulated rover whose ``simulation.speed`` is ``max``; return it then.
 
         Raises ClientError ``time_passes`` where time passes by itself.
         """
-        return self.daemon.command(TimeTold, "POST", "/simulation/time", {"advance_s": duration_s})
+        return self.daemon.command(SimulationTime, "POST", "/simulation/time", {"advance_s": duration_s})
 
     def truth(
         self,
@@ -97,7 +97,7 @@ class SimulationCalls:
         *,
         pixel: tuple[float, float] | None = None,
         position_in_site_m: Sequence[float] | None = None,
-    ) -> TruthTold:
+    ) -> PointTruth:
         """Return what a pixel (x, y) of a frame truly shows, or where a point of the site truly lies in it.
 
         ``position_m`` is in the rover frame when the frame was taken; ``pixel_px`` null where the camera
@@ -109,11 +109,11 @@ class SimulationCalls:
             query |= dict(zip(("x_px", "y_px"), pixel, strict=True))
         if position_in_site_m is not None:
             query |= dict(zip(("x_m", "y_m", "z_m"), position_in_site_m, strict=True))
-        return self.daemon.json(TruthTold, "GET", "/simulation/truth", params=query)
+        return self.daemon.json(PointTruth, "GET", "/simulation/truth", params=query)
 
-    def fault_words(self) -> dict[str, dict[str, WordTold]]:
+    def fault_words(self) -> dict[str, dict[str, FaultWord]]:
         """Return the fault words of each simulated device: each one's ``effect``, and its ``parameters``."""
-        return self.daemon.json(WordsTold, "GET", "/simulation/words")["devices"]
+        return self.daemon.json(FaultWordList, "GET", "/simulation/words")["devices"]
 
     def faults(self) -> list[FaultSet]:
         """Return the faults that are switched on in a simulated rover."""

@@ -23,7 +23,7 @@ from queue import SimpleQueue
 from typing import Any, TypeVar
 
 from drivers.clock import Clock
-from mastctl.answers import RecorderTold, RecordingDeleted, RecordingEnded, RecordingListed, Recordings
+from mastctl.answers import RecorderState, RecordingDeleted, RecordingEnded, RecordingListed, Recordings
 from mastctl.as_json import readable
 from mastctl.control.publisher import TOPICS, Published, Publisher, Topic
 from mastctl.control.standing import StandingFault
@@ -120,7 +120,7 @@ class Recorder:
         entry = Entry("handoff", line["time"], line, self._clock.now_s())
         self._request(lambda: self._write([entry], time.monotonic()))
 
-    def summary(self) -> RecorderTold:
+    def summary(self) -> RecorderState:
         """Return what is recorded now."""
         file, fault = self._file, self._fault
         return {
@@ -175,7 +175,7 @@ class Recorder:
         """
         return self._result(lambda: self._delete(name))
 
-    def start_run(self, name: str) -> RecorderTold:
+    def start_run(self, name: str) -> RecorderState:
         """Begin a run and return `summary`.
 
         Raises NotNow ``recording`` if one is recorded already, Unable ``unwritable``, ``disk_low``, ``slow``.
@@ -450,7 +450,7 @@ class Recorder:
         if file is not None:
             file.finish(wait=wait)
 
-    def _start_run(self, name: str) -> RecorderTold:
+    def _start_run(self, name: str) -> RecorderState:
         if self._run is not None:
             raise NotNow("recording", f"the run {self._run} is recorded already; end it first")
         self._end_file()

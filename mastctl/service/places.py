@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.errors import BadFile
-from mastctl.answers import PlacesTold, PlaceTold
+from mastctl.answers import HeadPlace, PlaceList
 from mastctl.errors import BadRequest, NotKnown, Unable
 from mastctl.safety.state_file import StateFile
 
@@ -19,7 +19,7 @@ HOME = "home"
 MOST = 50
 
 
-AT_HOME: PlaceTold = {"pan_rad": 0.0, "tilt_rad": 0.0}
+AT_HOME: HeadPlace = {"pan_rad": 0.0, "tilt_rad": 0.0}
 """Home, until somebody keeps another one."""
 
 
@@ -38,13 +38,13 @@ class Places:
         self._file = StateFile(folder / FILE, SCHEMA)
         self._writing = threading.Lock()
 
-    def all(self) -> PlacesTold:
+    def all(self) -> PlaceList:
         """Return every place by its name as JSON, home first. Raises Unable ``unreadable``."""
         kept = self._read()
         ordered = {HOME: kept.pop(HOME, AT_HOME), **dict(sorted(kept.items()))}
         return {"places": ordered}
 
-    def keep(self, name: str, place: PlaceTold) -> PlacesTold:
+    def keep(self, name: str, place: HeadPlace) -> PlaceList:
         """Keep a place by a name, in the place of a former one, and return all.
 
         Raises
@@ -63,7 +63,7 @@ class Places:
             self._write({**kept, name: place})
         return self.all()
 
-    def forget(self, name: str) -> PlacesTold:
+    def forget(self, name: str) -> PlaceList:
         """Forget a place and return all that are left; a forgotten home is 0, 0 again.
 
         Raises
@@ -80,7 +80,7 @@ class Places:
             self._write({one: place for one, place in kept.items() if one != name})
         return self.all()
 
-    def _read(self) -> dict[str, PlaceTold]:
+    def _read(self) -> dict[str, HeadPlace]:
         try:
             document = self._file.read() or {}
             places = document.get("places", {})
@@ -91,16 +91,16 @@ class Places:
             words = f"{self._file.path}: places: {error!r} where pan_rad and tilt_rad of each are expected"
             raise Unable("unreadable", words) from None
 
-    def _write(self, places: Mapping[str, PlaceTold]) -> None:
+    def _write(self, places: Mapping[str, HeadPlace]) -> None:
         try:
             self._file.write({"places": dict(places)})
         except BadFile as error:
             raise Unable("not_saved", str(error)) from None
 
 
-def _place(kept: Any) -> PlaceTold:
+def _place(kept: Any) -> HeadPlace:
     """A place as it was written. Raises KeyError, TypeError, ValueError."""
-    place: PlaceTold = {"pan_rad": float(kept["pan_rad"]), "tilt_rad": float(kept["tilt_rad"])}
+    place: HeadPlace = {"pan_rad": float(kept["pan_rad"]), "tilt_rad": float(kept["tilt_rad"])}
     if not (math.isfinite(place["pan_rad"]) and math.isfinite(place["tilt_rad"])):
         raise ValueError(f"{place} is not finite")
     return place

@@ -14,7 +14,7 @@ from typing import Any
 from calib.errors import BadFile
 from calib.files.yaml_text import parse_mapping
 from drivers.errors import BadOptions
-from mastctl.answers import ChangeTold, ReloadTold
+from mastctl.answers import ConfigChange, ReloadResult
 from mastctl.config import Config, check_cameras, load_config, parse_config
 from mastctl.devices.limits import OutsideLimits
 from mastctl.errors import BadRequest, NotNow
@@ -35,7 +35,7 @@ FIXED: Mapping[str, tuple[Callable[[Config], object], str]] = {
 """What a running daemon cannot change, by key: what a configuration says of it, and why it cannot."""
 
 
-def reload(service: Service) -> ReloadTold:
+def reload(service: Service) -> ReloadResult:
     """Read the configuration's file again and use what it says; return what changed and what to know of it.
 
     Returns
@@ -62,7 +62,7 @@ def reload(service: Service) -> ReloadTold:
             service.manager.ready()
 
 
-def _reload(service: Service) -> ReloadTold:
+def _reload(service: Service) -> ReloadResult:
     """Reload; nobody else does meanwhile."""
     before = service.config
     try:
@@ -108,7 +108,7 @@ def _next_mast(before: Config, after: Config, service: Service) -> MastInUse | N
     return None if named.stored.digest == now.stored.digest else named
 
 
-def _changes(before: Config, after: Config) -> Iterator[ChangeTold]:
+def _changes(before: Config, after: Config) -> Iterator[ConfigChange]:
     """What the two files say differently, key by key."""
     old, new = (_flat(config) for config in (before, after))
     for key in sorted({*old, *new}):

@@ -27,7 +27,7 @@ from calib.files.mast_file import StoredRig
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
-from mastctl.answers import CalibrationTold, MeasuredTold, ResidualsTold, SelfCheck, SentinelTold
+from mastctl.answers import CalibrationTold, CountedPointing, ResidualVerdict, SelfCheck, SentinelTold
 from mastctl.control.records import Operation
 from mastctl.watch.evidence import Evidence, Expected, Judge, Sums, expected, sums_of
 from mastctl.watch.journal import JournalThread
@@ -137,13 +137,13 @@ AS_LIKELY = math.log(20.0)
 """Cameras whose evidence is nearer than this to the strongest one's cannot be distinguished from it."""
 
 
-def residuals_told(
+def residual_verdict(
     verdict: Literal["good", "drifts", "few", "unknown"],
     sentence: str,
     pointings: int = 0,
     since: str | None = None,
     evidence: Evidence | None = None,
-) -> ResidualsTold:
+) -> ResidualVerdict:
     """Return a verdict with the figures of its evidence.
 
     ``since``: when the first of those pointings was that speak against the mast file (ISO 8601, UTC).
@@ -172,14 +172,14 @@ def residuals_told(
 TOO_FEW = f"fewer than {FEWEST} pointings with this mast file have a residual"
 
 
-def verdict_of(evidence: Evidence | None, pointings: int) -> ResidualsTold:
+def verdict_of(evidence: Evidence | None, pointings: int) -> ResidualVerdict:
     """Return the verdict on the evidence of the strongest window."""
     if evidence is None:
-        return residuals_told("few", TOO_FEW, pointings)
+        return residual_verdict("few", TOO_FEW, pointings)
     if evidence.log_evidence < LOG_THRESHOLD:
-        return residuals_told("good", "residuals are as the mast file predicts", pointings, None, evidence)
+        return residual_verdict("good", "residuals are as the mast file predicts", pointings, None, evidence)
     since = datetime.fromtimestamp(evidence.since_s, UTC).isoformat(timespec="seconds")
-    return residuals_told("drifts", _what_drifts(evidence, since), pointings, since, evidence)
+    return residual_verdict("drifts", _what_drifts(evidence, since), pointings, since, evidence)
 
 
 def _what_drifts(evidence: Evidence, since: str) -> str:
@@ -206,7 +206,7 @@ def _what_drifts(evidence: Evidence, since: str) -> str:
 
 
 def mast_verdict(
-    residuals: ResidualsTold, looks: SentinelTold | None, handoffs: SelfCheck
+    residuals: ResidualVerdict, looks: SentinelTold | None, handoffs: SelfCheck
 ) -> CalibrationTold:
     """Return the verdict as ``GET /status`` has it under ``calibration``.
 
@@ -250,7 +250,7 @@ class CalibrationHealth:
         self._judges_by = mast  # in the thread: it comes to the one in use by and by
         self._newest: tuple[Judged, ...] = ()
         self._not_kept = ""
-        self.verdict = residuals_told("few", TOO_FEW)
+        self.verdict = residual_verdict("few", TOO_FEW)
         thread.put(self._read)
         thread.put(lambda: self._judge_by(mast))
 
@@ -263,10 +263,10 @@ class CalibrationHealth:
     def use_mast(self, mast: StoredRig) -> None:
         """Judge by this mast file from now on."""
         self._mast = mast
-        self.verdict, self._newest = residuals_told("few", TOO_FEW), ()
+        self.verdict, self._newest = residual_verdict("few", TOO_FEW), ()
         self._thread.put(lambda: self._judge_by(mast))
 
-    def newest(self) -> list[MeasuredTold]:
+    def newest(self) -> list[CountedPointing]:
         """Return the newest pointings that count, the newest first."""
         return [
             {**one.measured, "sigma_px": list(one.sigma_px), "chi_square": one.square}
@@ -300,7 +300,7 @@ class CalibrationHealth:
         except CalibError as error:
             self._windows = None
             sentence = f"residuals are kept, and judged by nothing: {error}"
-            self._set_verdict(residuals_told("unknown", sentence), ())
+            self._set_verdict(residual_verdict("unknown", sentence), ())
             return
         for one in self._known:
             self._windows.add(one)
@@ -313,7 +313,7 @@ class CalibrationHealth:
         verdict = verdict_of(self._windows.evidence(), len(pointings))
         self._set_verdict(verdict, tuple(pointings[-SHOWN:]))
 
-    def _set_verdict(self, verdict: ResidualsTold, newest: tuple[Judged, ...]) -> None:
+    def _set_verdict(self, verdict: ResidualVerdict, newest: tuple[Judged, ...]) -> None:
         """Publish a verdict, unless another mast file is in use by now."""
         if self._judges_by is not self._mast:
             return

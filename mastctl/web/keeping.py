@@ -11,13 +11,13 @@ from fastapi.responses import FileResponse, Response
 from mastctl.answers import (
     BenchAnswer,
     BenchRuns,
-    MastsTold,
-    PlacesTold,
-    RecorderTold,
+    MastChange,
+    PlaceList,
+    RecorderState,
     RecordingDeleted,
     RecordingEnded,
     Recordings,
-    ReloadTold,
+    ReloadResult,
     ReportList,
 )
 from mastctl.as_json import readable
@@ -86,23 +86,23 @@ def add_masts(app: FastAPI) -> None:
         )
 
     @command(app, "POST /mast", MAST, "Use another mast file, or the former one, from now on")
-    def load_mast(body: MastBody, here: Here) -> MastsTold:
+    def load_mast(body: MastBody, here: Here) -> MastChange:
         masts = here.service.masts
         return _masts_told(masts, masts.back() if body.file is None else masts.load(body.file))
 
     @command(app, "POST /mast/back", MAST_BACK, "Go back to the former mast file")
-    def back(here: Here) -> MastsTold:
+    def back(here: Here) -> MastChange:
         masts = here.service.masts
         return _masts_told(masts, masts.back())
 
     @command(
         app, "POST /reload", RELOAD, "Read the configuration again: all of it comes into use, or nothing"
     )
-    def read_again(here: Here) -> ReloadTold:
+    def read_again(here: Here) -> ReloadResult:
         return reload(here.service)
 
 
-def _masts_told(masts: Masts, mast: MastInUse) -> MastsTold:
+def _masts_told(masts: Masts, mast: MastInUse) -> MastChange:
     former = masts.former
     return {"mast": mast.told(), "former_mast": None if former is None else former.told()}
 
@@ -111,15 +111,15 @@ def add_places(app: FastAPI) -> None:
     """Places of the head by a name; who goes there asks `POST /point` for its angles."""
 
     @app.get(f"{PREFIX}/places", summary="The places of the head that are kept by a name")
-    async def places(here: Here) -> PlacesTold:
+    async def places(here: Here) -> PlaceList:
         return await here.waiting.run(here.service.places.all)
 
     @command(app, "POST /places/{name}", PLACE_KEEP, "Keep a place by a name")
-    def keep(name: PlaceName, body: PlaceBody, here: Here) -> PlacesTold:
+    def keep(name: PlaceName, body: PlaceBody, here: Here) -> PlaceList:
         return here.service.places.keep(name, {"pan_rad": body.pan_rad, "tilt_rad": body.tilt_rad})
 
     @command(app, "DELETE /places/{name}", PLACE_FORGET, "Forget a place")
-    def forget(name: PlaceName, here: Here) -> PlacesTold:
+    def forget(name: PlaceName, here: Here) -> PlaceList:
         return here.service.places.forget(name)
 
 
@@ -133,7 +133,7 @@ def add_recordings(app: FastAPI) -> None:
     @command(
         app, "POST /recordings/start", RECORD_START, "Record until it is ended, or there is no room left"
     )
-    def start(body: RecordBody, here: Here) -> RecorderTold:
+    def start(body: RecordBody, here: Here) -> RecorderState:
         return here.service.recorder.start_run(body.name)
 
     @command(app, "POST /recordings/stop", RECORD_STOP, "End the recording that was begun")

@@ -25,7 +25,7 @@ from starlette.types import Scope
 
 from calib.files import is_plain_file
 from calib.geometry.rig import RigCamera
-from mastctl.answers import CameraMountTold, RigTold
+from mastctl.answers import CameraMount, RigSummary
 from mastctl.as_json import readable
 from mastctl.errors import NotKnown
 from mastctl.http import PREFIX
@@ -108,7 +108,7 @@ def add_page(app: FastAPI) -> None:
             app.add_api_route(place, give, methods=["GET"], include_in_schema=False)
 
     @app.get(f"{PREFIX}/rig", summary="The configured cameras by the mast file in use")
-    async def rig(here: Here) -> RigTold:
+    async def rig(here: Here) -> RigSummary:
         return await here.waiting.run(lambda: rig_told(here.service))
 
 
@@ -119,7 +119,7 @@ def _giver(data: bytes, kind: str, keep: str) -> Any:
     return give
 
 
-def rig_told(service: Service) -> RigTold:
+def rig_told(service: Service) -> RigSummary:
     """Return what of the rig is drawn. Reads the folder of the mast file."""
     stored = service.stored
     names = service.config.hardware.cameras
@@ -148,7 +148,7 @@ def _modified_s(path: Path) -> float | None:
         return None
 
 
-def _mount(name: str, camera: RigCamera, stereo: Stereo, names: Collection[str]) -> CameraMountTold:
+def _mount(name: str, camera: RigCamera, stereo: Stereo, names: Collection[str]) -> CameraMount:
     model = camera.model
     width, height = model.size_px
     x, y = (width - 1) / 2, (height - 1) / 2

@@ -15,16 +15,16 @@ from drivers.faults import BOUNDS, WHEN, FaultPanel, Word
 from drivers.faults import Fault as SetFault
 from drivers.simulation_clock import MAX, SimulationClock
 from mastctl.answers import (
-    BoardStands,
-    BoardsTold,
+    BoardList,
+    BoardPose,
+    FaultParameter,
     FaultSet,
     FaultsSet,
-    ParameterTold,
-    StandTold,
-    TimeTold,
-    TruthTold,
-    WordsTold,
-    WordTold,
+    FaultWord,
+    FaultWordList,
+    PointTruth,
+    SimulationTime,
+    TruePose,
 )
 from mastctl.as_json import as_json
 from mastctl.control.entry import (
@@ -59,21 +59,21 @@ def add_simulation(app: FastAPI) -> None:
     """The fault switches of a simulated rover, and where it truly stands."""
 
     @app.get(f"{PREFIX}/simulation/pose", summary="Where the simulated rover truly stands")
-    async def true_pose(here: Here) -> StandTold:
+    async def true_pose(here: Here) -> TruePose:
         return await here.waiting.run(lambda: _pose(_rover(here.service, "true poses").site_from_rover))
 
     @command(app, "POST /simulation/pose", SIMULATION_POSE, "Put the simulated rover somewhere on its ground")
-    def stand(body: StandBody, here: Here) -> StandTold:
+    def stand(body: StandBody, here: Here) -> TruePose:
         rover = _rover(here.service, "true poses")
         rover.stand(body.x_m, body.y_m, body.heading_rad, body.pitch_rad, body.roll_rad)
         return _pose(rover.site_from_rover)
 
     @app.get(f"{PREFIX}/simulation/boards", summary="The boards held up before the simulated rover")
-    async def boards(here: Here) -> BoardsTold:
+    async def boards(here: Here) -> BoardList:
         return await here.waiting.run(lambda: _boards(_rover(here.service, "boards")))
 
     @command(app, "POST /simulation/boards/{name}", SIMULATION_BOARD, "Hold up a board, or move it")
-    def put_board(name: BoardName, body: BoardBody, here: Here) -> BoardStands:
+    def put_board(name: BoardName, body: BoardBody, here: Here) -> BoardPose:
         rover = _rover(here.service, "boards")
         printed = None
         if body.board is not None:
@@ -98,17 +98,17 @@ def add_simulation(app: FastAPI) -> None:
         SIMULATION_BOARD_GONE,
         "Take a board away from the simulated rover",
     )
-    def take_board(name: BoardName, here: Here) -> BoardsTold:
+    def take_board(name: BoardName, here: Here) -> BoardList:
         rover = _rover(here.service, "boards")
         rover.take_board(name)
         return _boards(rover)
 
     @app.get(f"{PREFIX}/simulation/time", summary="The simulated rover's time, and how fast it goes")
-    async def time(here: Here) -> TimeTold:
+    async def time(here: Here) -> SimulationTime:
         return await here.waiting.run(lambda: _time(here.service))
 
     @command(app, "POST /simulation/time", SIMULATION_TIME, "Let time pass where it does not pass by itself")
-    def advance(body: TimeBody, here: Here) -> TimeTold:
+    def advance(body: TimeBody, here: Here) -> SimulationTime:
         speed = _time(here.service)["speed"]
         if speed != MAX:
             message = f"at simulation.speed {speed:g} time passes by itself; it is let pass only at {MAX}"
@@ -120,11 +120,11 @@ def add_simulation(app: FastAPI) -> None:
         f"{PREFIX}/simulation/truth",
         summary="The true point at a pixel of a frame, or the true pixel of a point",
     )
-    async def truth(query: Annotated[TruthQuery, Query()], here: Here) -> TruthTold:
+    async def truth(query: Annotated[TruthQuery, Query()], here: Here) -> PointTruth:
         return await here.waiting.run(lambda: _truth(here.service, query))
 
     @app.get(f"{PREFIX}/simulation/words", summary="The fault words of each device, with their parameters")
-    async def words(here: Here) -> WordsTold:
+    async def words(here: Here) -> FaultWordList:
         return await here.waiting.run(lambda: {"devices": _words(_panel(here.service))})
 
     @app.get(f"{PREFIX}/simulation/faults", summary="The faults that are switched on")
@@ -162,27 +162,27 @@ def _panel(service: Service) -> FaultPanel:
     return _rover(service, "faults").faults
 
 
-def _pose(frame: Rigid) -> StandTold:
+def _pose(frame: Rigid) -> TruePose:
     return {"position_m": frame.translation_m.tolist(), "quaternion": quaternion_of(frame.rotation)}
 
 
-def _board(rover: RoverModel, one: BenchBoard) -> BoardStands:
+def _board(rover: RoverModel, one: BenchBoard) -> BoardPose:
     rover_from_board = rover.site_from_rover.inverse @ one.site_from_board
     return {"board": document_of(one.board), "bow_m": list(one.bow_m), **_pose(rover_from_board)}
 
 
-def _boards(rover: RoverModel) -> BoardsTold:
+def _boards(rover: RoverModel) -> BoardList:
     return {"boards": {name: _board(rover, one) for name, one in rover.boards.items()}}
 
 
-def _time(service: Service) -> TimeTold:
+def _time(service: Service) -> SimulationTime:
     _rover(service, "clocks")
     clock = service.clock
     speed = clock.speed if isinstance(clock, SimulationClock) else 1.0
     return {"now_s": clock.now_s(), "speed": "max" if speed == math.inf else speed}
 
 
-def _truth(service: Service, query: TruthQuery) -> TruthTold:
+def _truth(service: Service, query: TruthQuery) -> PointTruth:
     """The truth asked for. Raises NoLonger and as `frame_by_id`."""
     rover = _rover(service, "truths")
     frame = service.devices.frame_by_id(query.frame_id)
@@ -197,7 +197,7 @@ def _truth(service: Service, query: TruthQuery) -> TruthTold:
         raise NoLonger("frame_too_old", str(error.args[0])) from None
 
 
-def _truth_of(site_from_rover: Rigid, point_m: FloatArray | None, pixel_px: Any) -> TruthTold:
+def _truth_of(site_from_rover: Rigid, point_m: FloatArray | None, pixel_px: Any) -> PointTruth:
     """A point of the rover frame and its pixel as JSON; without a point nothing is known."""
     if point_m is None:
         return {"position_in_site_m": None, "position_m": None, "pixel_px": None}
@@ -209,14 +209,14 @@ def _truth_of(site_from_rover: Rigid, point_m: FloatArray | None, pixel_px: Any)
     }
 
 
-def _words(panel: FaultPanel) -> dict[str, dict[str, WordTold]]:
+def _words(panel: FaultPanel) -> dict[str, dict[str, FaultWord]]:
     """The fault words of each device; what has no end is null."""
 
-    def parameter(name: str, usual: float) -> ParameterTold:
+    def parameter(name: str, usual: float) -> FaultParameter:
         least, most = BOUNDS[name]
         return {"default": as_json(usual), "least": least, "most": as_json(most)}
 
-    def word(one: Word) -> WordTold:
+    def word(one: Word) -> FaultWord:
         parameters = {**one.parameters, **WHEN}
         return {
             "effect": one.does,

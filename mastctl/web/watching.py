@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from fastapi import FastAPI, Request, Response
 
-from mastctl.answers import CalibrationHealthTold, LiveTold, ReadyTold, SentinelTold
-from mastctl.answers.words import WELL
+from mastctl.answers import CalibrationReport, LiveTold, ReadyTold, SentinelTold
+from mastctl.answers.kinds import WELL
 from mastctl.errors import Unable
 from mastctl.http import PREFIX
 from mastctl.http.entrance import from_this_machine
@@ -52,7 +52,7 @@ def add_watching(app: FastAPI) -> None:
         f"{PREFIX}/calibration/health",
         summary="Whether the mast file still holds, with the figures of the last days' residuals",
     )
-    async def calibration(here: Here) -> CalibrationHealthTold:
+    async def calibration(here: Here) -> CalibrationReport:
         service = here.service
         health = service.health
         return {

@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
-from mastctl.answers import ResidualsTold
-from mastctl.watch.residuals import mast_verdict, residuals_told
+from mastctl.answers import ResidualVerdict
+from mastctl.watch.residuals import mast_verdict, residual_verdict
 
-NOTHING_YET = residuals_told("few", "few pointings")
-DRIFTS = residuals_told("drifts", "navcam_left looks 2 mrad beside", 9, "2026-05-02T00:00:00+00:00")
+NOTHING_YET = residual_verdict("few", "few pointings")
+DRIFTS = residual_verdict("drifts", "navcam_left looks 2 mrad beside", 9, "2026-05-02T00:00:00+00:00")
 SLIPPED = {"level": "bad", "sentence": "pan slipped by 4 mrad", "since": "2026-05-01T00:00:00+00:00"}
 OFFSET = {"sentence": "hazcam_left sees targets 2 px right"}
 
@@ -32,7 +32,7 @@ OFFSET = {"sentence": "hazcam_left sees targets 2 px right"}
     ],
 )  # fmt: skip
 def test_the_mast_file_holds_as_long_as_nothing_speaks_against_it(
-    residuals: ResidualsTold, looks: Any, offsets: Any, verdict: str, sentence: str, since: str | None
+    residuals: ResidualVerdict, looks: Any, offsets: Any, verdict: str, sentence: str, since: str | None
 ) -> None:
     told = mast_verdict(residuals, looks, {"handoffs": 3, "offsets": offsets})
     assert told == {

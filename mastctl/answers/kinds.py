@@ -1,4 +1,4 @@
-"""The words and kinds of numbers that answers are made of, and how every refusal looks."""
+"""The states and kinds of numbers that answers are made of, and the form of every refusal."""
 
 from __future__ import annotations
 
