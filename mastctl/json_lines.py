@@ -16,49 +16,25 @@ class OtherFile(ValueError):
     """The file does not begin as its lines do."""
 
 
-def append_line(path: Path, line: bytes, most_bytes: int | None = None, begins: bytes = b"") -> bool:
-    """Append a line; several processes may append to one file.
+def append_line(
+    path: Path, line: bytes, most_bytes: int | None = None, begins: bytes = b"", mode: int = 0o666
+) -> bool:
+    """Append a line with its end; several processes may append to one file. Return whether there was room.
 
-    What a crash has left of a line at the end of the file is taken away first.
-
-    Parameters
-    ----------
-    path
-        Made if it is not there; its folder must be.
-    line
-        With its end.
-    most_bytes
-        How long the file may become; None: as long as it may.
-    begins
-        What the file begins with if it holds such lines.
-
-    Returns
-    -------
-    bool
-        Whether there was room for it.
-
-    Raises
-    ------
-    OtherFile
-        If the file is something else; nothing was written.
-    OSError
-        If the file system refuses.
+    What a crash has left of a line at the end of the file is taken away first. The file, which is made if it
+    is not there, holds up to ``most_bytes`` and starts with ``begins``. Raises OtherFile if it is something
+    else (nothing was written then), OSError.
     """
-    with path.open("a+b") as file:
+    flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC
+    with os.fdopen(os.open(path, flags, mode), "a+b") as file:
         fcntl.flock(file, fcntl.LOCK_EX)  # released when the file is closed
         end = _mended(file.fileno(), begins)
         if most_bytes is not None and os.fstat(file.fileno()).st_size + len(end + line) > most_bytes:
             return False
         file.write(end + line)
         file.flush()
-        os.fsync(file.fileno())
+        os.fdatasync(file.fileno())
     return True
-
-
-def mend(descriptor: int) -> int:
-    """Leave whole lines only in a file that is open for appending; return its size, bytes. Raises OSError."""
-    os.write(descriptor, _mended(descriptor, b""))
-    return os.fstat(descriptor).st_size
 
 
 def _mended(descriptor: int, begins: bytes) -> bytes:

@@ -9,11 +9,10 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import os
 import threading
 from collections.abc import Mapping
 from datetime import UTC, datetime
-from logging.handlers import RotatingFileHandler
+from itertools import pairwise
 from pathlib import Path
 from queue import Queue
 from typing import Any
@@ -22,7 +21,7 @@ from drivers.clock import Clock, SystemClock
 from mastctl.as_json import writable
 from mastctl.control.standing import StandingFault
 from mastctl.errors import one_line
-from mastctl.json_lines import mend
+from mastctl.json_lines import append_line
 
 log = logging.getLogger(__name__)
 
@@ -36,18 +35,9 @@ LONGEST_LINE = 16384
 
 
 class AuditLog:
-    """A file of JSON lines, and those before it, ``NAME.1`` to ``NAME.7``; never blocks, never raises.
+    """A file of JSON lines of mode 0600, and those before it, ``NAME.1`` to ``NAME.7``.
 
-    Parameters
-    ----------
-    path
-        The file, made with mode 0600; None to keep nothing.
-    clock
-        Stamps the fault.
-    file_bytes, files
-        When a new file begins, and how many are kept with it.
-    device
-        The name of its fault.
+    It never blocks, and never raises; without a path it keeps nothing. ``device`` is the name of its fault.
     """
 
     def __init__(
@@ -66,7 +56,7 @@ class AuditLog:
         self._fault: StandingFault | None = None
         self._closed = path is None
         if path is not None:
-            self._file = _File(path, file_bytes, files)
+            self._path, self._file_bytes, self._files = path, file_bytes, files
             self._thread = threading.Thread(target=self._work, name="audit log", daemon=True)
             self._thread.start()
 
@@ -111,13 +101,12 @@ class AuditLog:
                 entry.set()
             else:
                 self._write(entry)
-        self._file.close()
 
     def _write(self, record: Mapping[str, Any]) -> None:
         lost = self._lost
         try:
             lines = [{"time": datetime.now(UTC).isoformat(), "lost": lost}] if lost else []
-            self._file.append("\n".join(map(_line, [*lines, record])))
+            self._append("".join(f"{_line(one)}\n" for one in (*lines, record)).encode())
         except Exception as error:  # the disk's, or of a record that cannot be written; the next one may be
             self._count_lost(1)
             self._fail(error)
@@ -127,56 +116,23 @@ class AuditLog:
             log.warning("the audit log is written again; %d lines are missing in it", lost)
         self._fault = None
 
+    def _append(self, text: bytes) -> None:
+        """Append lines, in a new file where this one is full."""
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        if not append_line(self._path, text, self._file_bytes, mode=0o600):
+            names = [self._path, *(Path(f"{self._path}.{number}") for number in range(1, self._files))]
+            for older, newer in reversed(list(pairwise(names))):
+                with contextlib.suppress(FileNotFoundError):
+                    older.replace(newer)
+            append_line(self._path, text, mode=0o600)
+
     def _fail(self, error: Exception) -> None:
         why = error.strerror if isinstance(error, OSError) else None
-        message = f"commands are not recorded: {self._file.baseFilename}: {why or one_line(error, 200)}"
+        message = f"commands are not recorded: {self._path}: {why or one_line(error, 200)}"
         if self._fault is None:
             log.error("%s", message)
             until = "a command can be recorded again"
             self._fault = StandingFault(self._device, "not_recorded", message, self._clock.now_s(), until)
-
-
-class _File(RotatingFileHandler):
-    """Lines in a file of mode 0600 and in those before it; each is whole, and synced to the disk."""
-
-    def __init__(self, path: Path, most_bytes: int, files: int) -> None:
-        super().__init__(path, maxBytes=most_bytes, backupCount=files - 1, encoding="utf-8", delay=True)
-        self.rotator = _rotate
-
-    def append(self, text: str) -> None:
-        """Append lines, or leave the file as it was when it is opened next. Raises what the disk raises."""
-        try:
-            if self.stream is None:
-                _mend(Path(self.baseFilename))
-            self.emit(logging.makeLogRecord({"msg": text}))
-            if self.stream is not None:
-                os.fdatasync(self.stream.fileno())
-        except BaseException:
-            with contextlib.suppress(OSError):
-                stream, self.stream = self.stream, None
-                if stream is not None:
-                    stream.close()
-            raise
-
-    def handleError(self, record: logging.LogRecord) -> None:
-        """Raise what `emit` has met."""
-        raise
-
-
-def _mend(path: Path) -> None:
-    """Make the file if there is none, and take away what a crash or a full disk has left of a line."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
-    try:
-        mend(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _rotate(source: str, target: str) -> None:
-    """Keep a full file by its new name, and begin the next with its mode."""
-    Path(source).replace(target)
-    _mend(Path(source))
 
 
 def _line(record: Mapping[str, Any]) -> str:
