@@ -14,7 +14,7 @@ from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, cell
 from mastctl.cli.service import steers
 
 if TYPE_CHECKING:
-    from mastctl.client.answers import FaultSet, MastsTold
+    from mastctl.client.answers import FaultSet, MastChange
     from mastctl.http.tokens import TokenList
 
 GROUPS |= {
@@ -180,7 +180,7 @@ def _back(args: argparse.Namespace) -> Answer:
         return _masts(client.use_former_mast())
 
 
-def _masts(masts: MastsTold) -> Answer:
+def _masts(masts: MastChange) -> Answer:
     now, former = masts["mast"], masts["former_mast"]
     line = f"{now['file']} ({now['name']}, {now['digest'][:8]}...)"
     if former is not None:

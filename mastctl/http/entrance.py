@@ -15,9 +15,8 @@ from urllib.parse import urlsplit
 
 from mastctl.config import is_loopback
 from mastctl.control.caller import NETWORK, Caller, client_name
-from mastctl.errors import NotLetIn
+from mastctl.errors import NotAllowed, NotLetIn
 from mastctl.http.access import Access
-from mastctl.http.refusals import GuardError
 from mastctl.http.tokens import Token
 
 
@@ -32,7 +31,7 @@ class HostNames:
     any_address: bool = False
 
     def check_host(self, headers: Mapping[str, str]) -> None:
-        """Pass a request for one of these names. Raises GuardError ``foreign_host``."""
+        """Pass a request for one of these names. Raises NotAllowed ``foreign_host``."""
         host = headers.get("host", "")
         try:
             name = urlsplit(f"//{host}").hostname or ""
@@ -42,10 +41,10 @@ class HostNames:
             return
         known = ", ".join(sorted(self.hosts)) or "a loopback name such as 127.0.0.1"
         expected = f"{known} is expected (listen.hosts of the configuration)"
-        raise GuardError(403, "foreign_host", f"Host is '{_shown(host)}' where {expected}")
+        raise NotAllowed("foreign_host", f"Host is '{_shown(host)}' where {expected}")
 
     def check_origin(self, headers: Mapping[str, str]) -> None:
-        """Pass a request that comes from no other site's page. Raises GuardError ``foreign_origin``."""
+        """Pass a request that comes from no other site's page. Raises NotAllowed ``foreign_origin``."""
         origin = headers.get("origin")
         if origin is None:
             return
@@ -56,13 +55,13 @@ class HostNames:
         host = headers.get("host", "").lower()
         if not host or parts.netloc.lower() != host or parts.scheme not in SCHEMES:
             message = f"Origin is '{_shown(origin)}', which is not this service"
-            raise GuardError(403, "foreign_origin", message)
+            raise NotAllowed("foreign_origin", message)
 
 
 def check_site(headers: Mapping[str, str], *, page: bool = False) -> None:
     """Pass a request that no browser marks as one of another site's page; to a ``page`` others may link.
 
-    Raises GuardError ``foreign_origin``.
+    Raises NotAllowed ``foreign_origin``.
     """
     site = headers.get("sec-fetch-site", "none").lower()
     if site in ("same-origin", "none"):
@@ -70,7 +69,7 @@ def check_site(headers: Mapping[str, str], *, page: bool = False) -> None:
     if page and headers.get("sec-fetch-mode") == "navigate" and headers.get("sec-fetch-dest") == "document":
         return
     message = f"Sec-Fetch-Site is '{_shown(site)}': only the service's own page may request this"
-    raise GuardError(403, "foreign_origin", message)
+    raise NotAllowed("foreign_origin", message)
 
 
 def _is_address(name: str) -> bool:
@@ -105,7 +104,7 @@ class EntryRules:
     def caller(self, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
         """Return the caller of a request.
 
-        Raises NotLetIn ``no_token``, ``wrong_token``, GuardError ``foreign_origin`` for a page's cookie
+        Raises NotLetIn ``no_token``, ``wrong_token``, NotAllowed ``foreign_origin`` for a page's cookie
         without an Origin where something is changed.
         """
         if self.access is None:
@@ -122,7 +121,7 @@ class EntryRules:
             raise NotLetIn("no_token", "a token is expected: Authorization: Bearer TOKEN, or a cookie")
         token = self.access.token_of(text)
         if by_cookie and changes(scope) and "origin" not in headers:
-            raise GuardError(403, "foreign_origin", "a request with the page's cookie carries its Origin")
+            raise NotAllowed("foreign_origin", "a request with the page's cookie carries its Origin")
         return _named(token, scope, headers)
 
     def stopper(self, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:

@@ -17,10 +17,10 @@ from urllib.parse import parse_qsl
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mastctl.control.caller import Caller
-from mastctl.errors import MastctlError, one_line
+from mastctl.errors import BadRequest, MastctlError, NotAllowed, one_line
 from mastctl.http import PREFIX
 from mastctl.http.entrance import EntryRules, changes, check_site, shown_token
-from mastctl.http.refusals import GuardError, error_response, marked, refusal_response
+from mastctl.http.refusals import BadHttp, marked, refusal_response
 
 log = logging.getLogger(__name__)
 
@@ -103,14 +103,11 @@ class Guard:
                     body = await whole_body(receive, headers)
                     scope["state"] |= {"body": body, "json": read_json(body, headers)}
             await self._app(scope, receive, send_marked)
-        except (GuardError, MastctlError) as refused:
+        except Exception as error:
+            if not isinstance(error, MastctlError):  # a defect: the client gets a sentence, the log the rest
+                log.exception("%s %s met a defect of the program", scope["method"], scope["path"])
             if not started:
-                await refusal_response(refused)(scope, receive, send_marked)
-        except Exception:  # a defect: the client gets a sentence, the log the rest
-            log.exception("%s %s met a defect of the program", scope["method"], scope["path"])
-            if not started:
-                message = "the service met a defect of its own; its log says more"
-                await error_response(500, "internal", message)(scope, receive, send_marked)
+                await refusal_response(error)(scope, receive, send_marked)
 
     async def _websocket(self, scope: Scope, receive: Receive, send: Send) -> None:
         """As for HTTP; for a browser's request the headers that state its page are the only evidence."""
@@ -122,8 +119,8 @@ class Guard:
             by_cookie = self._entrance.access is not None and shown_token(scope, headers)[1]
             if by_cookie and "origin" not in headers:
                 message = "a WebSocket with the page's cookie carries its Origin"
-                raise GuardError(403, "foreign_origin", message)
-        except (GuardError, MastctlError) as refused:
+                raise NotAllowed("foreign_origin", message)
+        except MastctlError as refused:
             self._record(scope, bytes(refusal_response(refused).body))
             await _refuse_websocket(refused, scope, receive, send)
             return
@@ -156,7 +153,7 @@ class Guard:
             # The entry checks each command's role. A body, and a jog's heartbeat, are read before the entry.
             if changes(scope) and path != SESSION and not caller.may("operate"):
                 message = f"{caller.name} may {caller.role}; {scope['method']} {path[:80]} needs operate"
-                raise GuardError(403, "role", message)
+                raise NotAllowed("role", message)
 
     def _record(self, scope: Scope, body: bytes) -> None:
         """Record a refusal, by its answer's body, that no record of a command has."""
@@ -187,11 +184,11 @@ def _set_caller(scope: Scope, caller: Caller) -> None:
 
 
 def _check_no_secret(scope: Scope) -> None:
-    """Refuse a token in an address: addresses are kept in logs and histories. Raises GuardError."""
+    """Refuse a token in an address: addresses are kept in logs and histories. Raises BadHttp."""
     keys = {key.lower() for key, _ in parse_qsl(scope["query_string"].decode("latin-1"), True)}
     if keys & _SECRETS:
         message = "a token belongs in the header Authorization, never in an address; revoke this one"
-        raise GuardError(400, "token_in_address", message)
+        raise BadHttp(400, "token_in_address", message)
 
 
 async def _refuse_websocket(refused: Exception, scope: Scope, receive: Receive, send: Send) -> None:
@@ -203,7 +200,7 @@ async def _refuse_websocket(refused: Exception, scope: Scope, receive: Receive, 
 
 
 async def whole_body(receive: Receive, headers: Mapping[str, str]) -> bytes:
-    """Return the whole body, which may not be large. Raises GuardError."""
+    """Return the whole body, which may not be large. Raises BadHttp."""
     length = headers.get("content-length", "0")
     if length.isdecimal() and int(length[:20]) > LARGEST_BODY_BYTES:
         _too_large()
@@ -212,7 +209,7 @@ async def whole_body(receive: Receive, headers: Mapping[str, str]) -> bytes:
     while True:
         message = await receive()
         if message["type"] == "http.disconnect":
-            raise GuardError(400, "disconnected", "the client left before its request had come whole")
+            raise BadHttp(400, "disconnected", "the client left before its request had come whole")
         part = message.get("body", b"")
         size += len(part)
         if size > LARGEST_BODY_BYTES:
@@ -223,27 +220,27 @@ async def whole_body(receive: Receive, headers: Mapping[str, str]) -> bytes:
 
 
 def _too_large() -> NoReturn:
-    raise GuardError(413, "too_large", f"the body is larger than {LARGEST_BODY_BYTES} bytes")
+    raise BadHttp(413, "too_large", f"the body is larger than {LARGEST_BODY_BYTES} bytes")
 
 
 def read_json(body: bytes, headers: Mapping[str, str]) -> Any:
     """Return the content of a body: JSON with finite numbers and each key once; None for nothing.
 
-    Raises GuardError ``not_json``, ``bad_request`` for a number that is larger than any float.
+    Raises BadHttp ``not_json``, BadRequest for a number that is larger than any float.
     """
     if not body.strip():
         return None
     kind = headers.get("content-type", "").partition(";")[0].strip().lower()
     if kind != "application/json":
-        raise GuardError(415, "not_json", f"Content-Type is '{kind[:60]}' where application/json is expected")
+        raise BadHttp(415, "not_json", f"Content-Type is '{kind[:60]}' where application/json is expected")
     try:
         return json.loads(
             body, parse_constant=_no_constant, parse_float=_finite, object_pairs_hook=_no_duplicates
         )
     except RecursionError:
-        raise GuardError(400, "not_json", "the body is nested too deeply") from None
+        raise BadHttp(400, "not_json", "the body is nested too deeply") from None
     except ValueError as error:
-        raise GuardError(400, "not_json", f"the body is not JSON: {' '.join(str(error).split())}") from None
+        raise BadHttp(400, "not_json", f"the body is not JSON: {' '.join(str(error).split())}") from None
 
 
 def _no_constant(text: str) -> NoReturn:
@@ -254,7 +251,7 @@ def _finite(text: str) -> float:
     number = float(text)
     if math.isinf(number):
         message = f"the body has the number {text[:40]} where at most {sys.float_info.max:.1e} is possible"
-        raise GuardError(422, "bad_request", message)
+        raise BadRequest("bad_request", message)
     return number
 
 

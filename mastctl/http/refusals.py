@@ -52,15 +52,14 @@ Headers = list[tuple[bytes, bytes]]
 Query = TypeVar("Query", bound=BaseModel)
 
 
-class GuardError(Exception):
-    """A request that does not get as far as the API."""
+class BadHttp(MastctlError):
+    """A request that does not get as far as the API, with a status of its own."""
 
-    def __init__(
-        self, status: int, code: str, message: str, headers: Mapping[str, str] | None = None
-    ) -> None:
+    code = "not_json"
+
+    def __init__(self, status: int, code: str, message: str) -> None:
         self.status = status
         self.code = code
-        self.headers = dict(headers or {})
         super().__init__(message)
 
 
@@ -141,14 +140,14 @@ STATUS_OF_KIND: Mapping[type[Exception], int] = {
 
 
 def status_of(error: Exception) -> int:
-    """Return the HTTP status of an error's family, the nearest one above its class."""
-    return next(STATUS_OF_KIND[kind] for kind in type(error).__mro__ if kind in STATUS_OF_KIND)
+    """Return the HTTP status of an error's family, the nearest one above its class; 500 of a defect."""
+    if isinstance(error, BadHttp):
+        return error.status
+    return next((STATUS_OF_KIND[kind] for kind in type(error).__mro__ if kind in STATUS_OF_KIND), 500)
 
 
 def refusal_response(error: Exception) -> JSONResponse:
-    """Return the answer to a request that met an error of these families."""
-    if isinstance(error, GuardError):
-        return error_response(error.status, error.code, str(error), headers=error.headers)
+    """Return the answer to a request that met an error."""
     body, headers = error_body(error), {}
     again_s = getattr(error, "retry_after_s", None)
     if again_s is not None:
@@ -164,7 +163,7 @@ def add_errors(app: FastAPI) -> None:
     async def ours(request: Request, error: Exception) -> JSONResponse:
         return refusal_response(error)
 
-    for kind in (MastctlError, DriverError, CalibError, GuardError):
+    for kind in (MastctlError, DriverError, CalibError, Exception):
         app.add_exception_handler(kind, ours)
 
     @app.exception_handler(RequestValidationError)
@@ -183,11 +182,6 @@ def add_errors(app: FastAPI) -> None:
         if error.status_code == 405:
             headers["Allow"] = ", ".join(_methods_of(app, request))
         return error_response(error.status_code, code, message, headers=headers)
-
-    @app.exception_handler(Exception)
-    async def defect(request: Request, error: Exception) -> JSONResponse:
-        body = error_body(error)
-        return error_response(500, body["code"], body["message"])
 
 
 def _methods_of(app: FastAPI, request: Request) -> list[str]:
