@@ -124,7 +124,7 @@ def test_a_file_that_hangs_keeps_nobody_waiting(
     rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hang, clock, file_time = Hang(), ManualClock(10.0), ManualClock()
-    monkeypatch.setattr(Journal, "append", lambda self, handoff: hang())
+    monkeypatch.setattr(Journal, "append", lambda self, *_: hang())
     monkeypatch.setattr(journal, "CLOSE_S", 0.05)
     before = set(threading.enumerate())
     thread = JournalThread(clock, file_time)

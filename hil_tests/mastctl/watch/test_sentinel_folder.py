@@ -60,7 +60,7 @@ def day(ago: float, changed: bool = False, views: int = 4) -> dict[str, Any]:
 def test_a_reference_comes_back_as_it_was_saved(tmp_path: Path) -> None:
     save_reference(tmp_path / "s", "2026-05-01T00:00:00+00:00", RESTS, pictures())
     reference = read_reference(tmp_path / "s")
-    assert reference.rests == tuple(RESTS)
+    assert reference.rests == [list(rest) for rest in RESTS]
     picture = reference.picture("eye", 1)
     assert picture is not None
     np.testing.assert_array_equal(picture.image, pictures()[1].image)
@@ -113,7 +113,7 @@ def test_a_disk_that_is_full_costs_the_new_reference_and_not_the_old(
         assert found.time == first.time
         assert len(read_looks(tmp_path, found)) == 1
         assert len(list(tmp_path.glob("pictures-*"))) == 1
-    monkeypatch.setattr("os.fsync", full)
+    monkeypatch.setattr("os.fdatasync", full)
     with pytest.raises(BadFile, match="No space left on device; the look is not kept"):
         add_look(tmp_path, first, NOW.isoformat(), SceneDrift(2))
 
