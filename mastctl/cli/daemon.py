@@ -47,13 +47,6 @@ def queue_output() -> None:
     signals.write_from_background()
 
 
-def refuse_daemon_options(args: argparse.Namespace) -> None:
-    """Refuse --url and --config beside --simulated, which needs no running daemon."""
-    for name in ("url", "config", "lease"):
-        if getattr(args, name) is not None:
-            raise WrongUse(f"--{name} names a running daemon; --simulated starts rovers of its own")
-
-
 @contextmanager
 def client_of(args: argparse.Namespace, *, default_address: bool = False) -> Iterator[Client]:
     """Give a client of the daemon that the options, or MASTCTL_URL, name.

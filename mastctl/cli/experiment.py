@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, NoReturn
 
 import mastctl
 from mastctl.cli import output
-from mastctl.cli.daemon import DAEMON, client_of, refuse_daemon_options
+from mastctl.cli.daemon import DAEMON, client_of
 from mastctl.cli.options import command, option
 from mastctl.cli.output import Answer, Shown, WrongUse, check_folder
 from mastctl.cli.rig import HEADS
-from mastctl.cli.tasks import TASKS, refuse_task_options, results_of, run_bar, simulated_daemon
+from mastctl.cli.tasks import TASKS, check_place, results_of, run_bar
 
 if TYPE_CHECKING:
     from mastctl.client import Client
@@ -97,11 +97,11 @@ for _name, _summary in STUDIES.items():
 def run_pointing(args: argparse.Namespace) -> Answer:
     """Run the experiment on the daemon that --url or --config names, or on simulated rovers of its own."""
     check_folder(args.out, "--out")
+    check_place(args)
     if args.simulated:
         return _run_simulated(args)
     if args.head is not None:
         raise WrongUse("--head belongs to --simulated; a running daemon has its own head")
-    refuse_task_options(args)
     with client_of(args) as client:
         return _report(args, _run(args, client, tuple(args.distances), None, ()))
 
@@ -111,7 +111,6 @@ def _run_simulated(args: argparse.Namespace) -> Answer:
     from mastctl.experiment.pointing_report import PICTURES_PER_DISTANCE
     from mastctl.experiment.simulated import PointingTask, Rover, joined_pointings, one_pointing
 
-    refuse_daemon_options(args)
     rover = Rover(args.head or HEADS.split("|")[0], args.seed)
     shown = PICTURES_PER_DISTANCE if args.out is not None else 0
     tasks = [
@@ -153,7 +152,9 @@ def _run_simulated(args: argparse.Namespace) -> Answer:
 )
 def run_demo(args: argparse.Namespace) -> Answer:
     """Start a simulated rover behind a daemon on a free port, and run the experiment on it."""
+    from mastctl.client import Client
     from mastctl.config import load_config
+    from mastctl.daemon import RunningDaemon
     from mastctl.experiment.pointing import head_pair
     from mastctl.experiment.simulated import SimulationTruth, demo_config, head_note, own_config
 
@@ -164,7 +165,10 @@ def run_demo(args: argparse.Namespace) -> Answer:
         )
     else:
         config = own_config(load_config(args.config), head=args.head, wire=args.wire, speed=args.speed)
-    with simulated_daemon(args, config) as (daemon, client):
+    compiles = "building the simulated rover and its ground (the first time also compiling the renderer)"
+    with output.waiting(args.json, compiles):
+        running = RunningDaemon(config)
+    with running as daemon, Client(daemon.url) as client:
         rover = daemon.hardware.simulation
         assert rover is not None  # both configurations are of simulated rovers
         rig = daemon.service.stored.rig

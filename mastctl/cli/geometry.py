@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mastctl.cli.mast_files import camera_name, nearest_of, need_joints, read_mast_file, stereo_pair
 from mastctl.cli.options import command, option, positive_number
-from mastctl.cli.output import Answer, Shown, WrongUse
+from mastctl.cli.output import Answer, Shown, WrongUse, tables_of
 
 if TYPE_CHECKING:
     from calib.geometry.handoff import Handoff, Joints
@@ -63,10 +63,7 @@ def solve_pointing(args: argparse.Namespace) -> Answer:
         rows,
         ["best first; the mast's limits belong to a configuration and are not applied"],
     )
-    keys = ("pan_rad", "tilt_rad", "range_m")
-    return Answer(
-        {"solutions": [{key: float(getattr(one, key)) for key in keys} for one in solutions]}, shown
-    )
+    return Answer({"solutions": solutions}, shown)
 
 
 @command(
@@ -90,8 +87,8 @@ def triangulate_pair(args: argparse.Namespace) -> Answer:
     )  # fmt: skip
     sigmas_mm = [1e3 * math.sqrt(max(0.0, variance)) for variance in seen.covariance_m2.diagonal()]
     document = {
-        "position_m": seen.position_m.tolist(),
-        "covariance_m2": seen.covariance_m2.tolist(),
+        "position_m": seen.position_m,
+        "covariance_m2": seen.covariance_m2,
         "ray_gap_m": seen.ray_gap_m,
     }
     axes = zip("xyz", document["position_m"], sigmas_mm, strict=True)
@@ -112,16 +109,9 @@ def error_budget(args: argparse.Namespace) -> Answer:
     """Compute the paper's Table I."""
     from calib.geometry.stereo import target_approach_budget
 
-    keys = ("stereo_cm", "untracked_cm", "tracked_cm")
-    rows = target_approach_budget()
-    shown = Shown(
-        "Target approach from 10 m to 1 m, 3-sigma errors (Table I of the paper)",
-        ("camera", "stereo cm", "untracked cm", "tracked cm"),
-        [(row.name, *(f"{getattr(row, key):.2f}" for key in keys)) for row in rows],
-    )
-    return Answer(
-        {"cameras": [{"name": row.name, **{key: getattr(row, key) for key in keys}} for row in rows]}, shown
-    )
+    rows = [row._asdict() for row in target_approach_budget()]
+    title = "Target approach from 10 m to 1 m, 3-sigma errors (Table I of the paper)"
+    return Answer({"cameras": rows}, tables_of({title: rows}))
 
 
 @command(
@@ -173,16 +163,16 @@ def _as_json(done: Handoff) -> dict[str, Any]:
             name: None
             if seen is None
             else {
-                "x_px": float(seen.pixel_px[0]),
-                "y_px": float(seen.pixel_px[1]),
-                "covariance_px2": seen.covariance_px2.tolist(),
-                "search_px2": seen.search_px2.tolist(),
+                "x_px": seen.pixel_px[0],
+                "y_px": seen.pixel_px[1],
+                "covariance_px2": seen.covariance_px2,
+                "search_px2": seen.search_px2,
             }
             for name, seen in done.pixels.items()
         },
-        "reasons": dict(done.reasons),
-        "position_m": done.seen.position_m.tolist(),
-        "covariance_m2": done.covariance_m2.tolist(),
+        "reasons": done.reasons,
+        "position_m": done.seen.position_m,
+        "covariance_m2": done.covariance_m2,
         "ray_gap_m": done.seen.ray_gap_m,
         "ray_gap_sigmas": done.gap.sigmas,
         "across_px": done.gap.across_px,

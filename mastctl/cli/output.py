@@ -84,7 +84,9 @@ class Answer(NamedTuple):
 def show(args: argparse.Namespace, answer: Answer) -> int:
     """Print an answer at once, as JSON or for people, and return its exit code."""
     if args.json:
-        print_json(answer.document)
+        from mastctl.as_json import as_json
+
+        print_json(as_json(answer.document))
     else:
         shown = answer.shown
         for one in (

@@ -1,20 +1,15 @@
-"""Simulation for any driver: simulated servos behind real bytes, `mastctl rig sim dynamixel|feetech|ptu`.
+"""Simulated servos behind real bytes for any driver: `mastctl rig sim dynamixel|feetech|ptu`.
 
-Each runs until SIGTERM, SIGINT (Ctrl-C) or, with --until-eof, the end of its standard input. JSON
-lines on standard input switch faults on and off while it runs. A terminal is never read: a job in the
-background would be stopped by the next keystroke (SIGTTIN).
+Each runs until SIGTERM or SIGINT (Ctrl-C).
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import json
-import os
-import select
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 from mastctl import signals
@@ -30,19 +25,12 @@ if TYPE_CHECKING:
 
 GROUPS["rig sim"] = "simulated servos behind a serial line or a TCP port; a new simulated rover"
 
-ABOUT = """\
-{} JSON lines from a file or a pipe on standard input, answered on standard error, switch faults:
-{{"word": "mute", "replies": 5}} a fault with parameters, {{"word": "overload", "angle_rad": 0.3, "at_s": 2}}
-from two seconds on, {{"clear": true}} all off. The faults are those of docs/drivers.md. A terminal is not
-read; `cat | mastctl rig sim ...` reads one. SIGTERM or Ctrl-C ends it."""
-
 PTY = option("--pty", "a serial line as a pseudo terminal")
 SERVED = (
     option("--link PATH", "with --pty: a stable name for the terminal"),
     option("--faults FILE", "a fault script, which begins at once"),
     option("--no-wire-time", "bytes take no time, and any baud rate is right"),
     option("--verbose", "log every piece that passes on standard error"),
-    option("--until-eof", "end when standard input ends"),
 )
 
 _PAN_TILT: tuple[Literal[0], Literal[1]] = (0, 1)
@@ -61,7 +49,6 @@ _PAN_TILT: tuple[Literal[0], Literal[1]] = (0, 1)
     one_of(PTY, required=True),
     *SERVED,
     help="a bus of Dynamixel servos (protocol 2.0)",
-    about=ABOUT.format("A bus of Dynamixel servos (protocol 2.0)."),
     example="--servo xl330_m288:1 --servo xl330_m288:2 --pty",
 )
 def _dynamixel(args: argparse.Namespace) -> int:
@@ -98,7 +85,6 @@ def _dynamixel(args: argparse.Namespace) -> int:
     one_of(PTY, required=True),
     *SERVED,
     help="a bus of two Feetech servos, ids 1 and 2",
-    about=ABOUT.format("A bus of two Feetech servos, ids 1 and 2."),
     example="--pty",
 )
 def _feetech(args: argparse.Namespace) -> int:
@@ -133,7 +119,6 @@ def _feetech(args: argparse.Namespace) -> int:
     one_of(PTY, option("--tcp [HOST:]PORT", "a TCP port; 0 is any free one"), required=True),
     *SERVED,
     help="a FLIR / Directed Perception pan/tilt unit",
-    about=ABOUT.format("A FLIR / Directed Perception pan/tilt unit."),
     example="--pty",
 )
 def _ptu(args: argparse.Namespace) -> int:
@@ -195,22 +180,22 @@ def _serve(
         raise WrongUse("--link goes with --pty")
     signals.write_from_background()
     observer = _observer(clock.now_s()) if args.verbose else None
-    with _signals() as wake:
-        if args.faults is not None:
-            panel.set_all(read_script(args.faults), origin=str(args.faults))
-        line: PtyLine | TcpLine
-        if tcp is None:
-            line = PtyLine(
-                device, clock, panel, link=args.link, wire_time=not args.no_wire_time, observer=observer
-            )
-            port = line.path
-        else:
-            host, number = _address(tcp)
-            line = TcpLine(device, clock, panel, host, number, banner=banner, observer=observer)
-            port = f"socket://{f'[{host}]' if ':' in host else host}:{line.port}"
-        with line:
-            output.show(args, Answer({"port": port, **facts}, port))
-            _follow_orders(panel, wake, args.until_eof)
+    if args.faults is not None:
+        panel.set_all(read_script(args.faults), origin=str(args.faults))
+    line: PtyLine | TcpLine
+    if tcp is None:
+        line = PtyLine(
+            device, clock, panel, link=args.link, wire_time=not args.no_wire_time, observer=observer
+        )
+        port = line.path
+    else:
+        host, number = _address(tcp)
+        line = TcpLine(device, clock, panel, host, number, banner=banner, observer=observer)
+        port = f"socket://{f'[{host}]' if ':' in host else host}:{line.port}"
+    with line, contextlib.suppress(KeyboardInterrupt):
+        output.show(args, Answer({"port": port, **facts}, port))
+        while True:
+            signal.pause()
     return 0
 
 
@@ -220,78 +205,6 @@ def _address(text: str) -> tuple[str, int]:
     if not (number.isascii() and number.isdigit() and int(number) <= 65535):
         raise WrongUse(f"--tcp is '{text}', expected [HOST:]PORT with a port from 0 to 65535")
     return host.strip("[]") or "127.0.0.1", int(number)
-
-
-@contextlib.contextmanager
-def _signals() -> Iterator[int]:
-    """Give a descriptor that SIGTERM and SIGINT make readable."""
-    read, write = os.pipe()
-    os.set_blocking(write, False)
-    before = {number: signal.signal(number, lambda *_: None) for number in (signal.SIGTERM, signal.SIGINT)}
-    old = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
-    try:
-        yield read
-    finally:
-        signal.set_wakeup_fd(old)
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        os.close(read)
-        os.close(write)
-
-
-def _follow_orders(panel: FaultPanel, wake: int, until_eof: bool) -> None:
-    """Carry out the lines of standard input, unless that is a terminal, until a signal comes."""
-    source: list[int] = []
-    with contextlib.suppress(OSError, ValueError, AttributeError):  # closed, or none at all
-        source = [] if sys.stdin.isatty() else [sys.stdin.fileno()]
-    rest = b""
-    while True:
-        try:
-            ready = select.select([wake, *source], [], [])[0]
-        except OSError:
-            source = []
-            continue
-        if wake in ready:
-            return
-        data = b""
-        with contextlib.suppress(OSError):
-            data = os.read(source[0], 65536)
-        lines = (rest + data).split(b"\n")
-        rest = lines.pop()
-        if not data:
-            lines.append(rest)
-        for line in lines:
-            if line.strip():
-                _order(panel, line)
-        if not data:
-            if until_eof:
-                return
-            source, rest = [], b""
-
-
-def _order(panel: FaultPanel, line: bytes) -> None:
-    """Switch a fault on, or faults off; a refusal goes to stderr and changes nothing."""
-    from drivers.errors import BadOptions
-    from drivers.faults import PAN_TILT
-
-    try:
-        order = json.loads(line)
-        if not isinstance(order, dict):
-            raise ValueError("an object is expected")
-    except ValueError as error:
-        output.tell(f"standard input: no JSON line ({error})")
-        return
-    try:
-        if "clear" in order:
-            if len(order) > 1 or order["clear"] not in (True, PAN_TILT):
-                raise BadOptions('expected {"clear": true} and nothing else')
-            panel.clear()
-            output.tell("all faults off")
-            return
-        panel.set_all([{"device": PAN_TILT, **order}], origin="standard input")
-        output.tell(f"fault {order['word']} set")
-    except BadOptions as error:
-        output.tell(f"standard input: {error}")
 
 
 def _observer(start_s: float) -> Callable[[Literal["host", "device"], bytes, float], None]:

@@ -13,9 +13,7 @@ from mastctl.cli import output
 from mastctl.cli.options import Group, option
 
 if TYPE_CHECKING:
-    from mastctl.client import Client
-    from mastctl.config import Config
-    from mastctl.daemon import RunningDaemon
+    pass
 
 
 Task = TypeVar("Task")
@@ -33,8 +31,15 @@ TASKS = Group(
 )
 
 
-def refuse_task_options(args: argparse.Namespace) -> None:
-    """Refuse the options of tasks for a running daemon, which is one mast. Raises WrongUse."""
+def check_place(args: argparse.Namespace) -> None:
+    """Refuse options of a running daemon beside --simulated, and of tasks without it. Raises WrongUse."""
+    if args.simulated:
+        for name in ("url", "config", "lease"):
+            if getattr(args, name) is not None:
+                raise output.WrongUse(
+                    f"--{name} names a running daemon; --simulated starts rovers of its own"
+                )
+        return
     for name, usual in (("executor", "local"), ("workers", None), ("results", None)):
         if getattr(args, name) != usual:
             raise output.WrongUse(
@@ -50,7 +55,6 @@ def results_of(
     tasks: Sequence[Task],
     label: Callable[[Task], str] = str,
     failure: Callable[[Result], str] = lambda _: "",
-    done: Callable[[Result], None] = lambda _: None,
     found: Callable[[Result], str] = lambda _: "",
 ) -> list[Result]:
     """Run a command's tasks as its options say, with a progress bar on stderr.
@@ -63,8 +67,6 @@ def results_of(
         As `mastctl.experiment.tasks.Work`.
     failure
         The reason that a result is a failure, shown as it comes; empty if it is none.
-    done
-        Called with each result as it comes, in any order.
     found
         A line for a result that is no failure; empty for none.
 
@@ -85,7 +87,6 @@ def results_of(
     def ended(task: Task, result: Result) -> None:
         why, line = failure(result), found(result)
         step("", why and f"{label(task)}: {why}", line and f"{label(task)}: {line}")
-        done(result)
 
     try:
         with run_bar(args, what, len(set(work.ids))) as step:
@@ -96,20 +97,6 @@ def results_of(
             count = sum(map(kept.holds, set(work.ids)))
             output.tell(f"{count} of {of} tasks are kept in {folder}; the same command goes on with the rest")
         raise
-
-
-@contextmanager
-def simulated_daemon(args: argparse.Namespace, config: Config) -> Iterator[tuple[RunningDaemon, Client]]:
-    """Start a simulated rover behind a daemon on a free port, with a client of it, and end it."""
-    from mastctl.client import Client
-    from mastctl.daemon import RunningDaemon
-
-    with output.waiting(
-        args.json, "building the simulated rover and its ground (the first time also compiling the renderer)"
-    ):
-        daemon = RunningDaemon(config)
-    with daemon, Client(daemon.url) as client:
-        yield daemon, client
 
 
 @contextmanager

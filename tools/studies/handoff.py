@@ -20,10 +20,10 @@ import numpy as np
 from calib.files.mast_file import load_rig
 from calib.matching.handed_over import handoff_bias
 from mastctl.cli import output
-from mastctl.cli.daemon import DAEMON, client_of, refuse_daemon_options
+from mastctl.cli.daemon import DAEMON, client_of
 from mastctl.cli.options import add_options, at_least
 from mastctl.cli.output import check_folder
-from mastctl.cli.tasks import refuse_task_options, results_of, run_bar
+from mastctl.cli.tasks import check_place, results_of, run_bar
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.experiment.simulated import Rover, SimulationTruth, running_rover
@@ -136,16 +136,15 @@ def main(words: Sequence[str] | None = None) -> int:
     if args.mast_file is not None and not args.simulated:
         raise output.WrongUse("--mast-file belongs to --simulated; a running daemon has its own mast file")
     check_folder(args.out, "--out")
+    check_place(args)
     if args.simulated:
         return _report(args, _simulated(args))
-    refuse_task_options(args)
     with client_of(args) as client:
         return _report(args, _on_daemon(args, client))
 
 
 def _simulated(args: argparse.Namespace) -> list[HandoffRecord]:
     """Run each target on a simulated rover of its own."""
-    refuse_daemon_options(args)
     stereo = load_rig(args.mast_file or load_config(None).mast_file).rig.stereo
     sources = [source for source, to, _ in STEPS if {source, to} <= set(stereo)]
     if not sources:
