@@ -20,10 +20,9 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.geometry.lenses import Lens
 from calib.geometry.lenses.opencv import OpencvLens
 from calib.geometry.lenses.round import RoundLens
-from calib.geometry.projection import Projection, project_as_published
+from calib.geometry.projection import Lens, Projection, project_as_published
 from calib.geometry.rigid import FloatArray, ReadOnlyArrays, Rigid, frozen_array, tangents, turning
 
 Kind = Literal[
@@ -83,15 +82,14 @@ class CameraModel(ReadOnlyArrays):
     Attributes
     ----------
     kind
-        Says which letters count: CAHV ignores O, R and E, CAHVOR ignores E, OpenCV's families all three.
-        Those that do not count are kept as O = A, R = 0, E = 0.
+        Says which letters matter: CAHV ignores O, R and E, CAHVOR ignores E, OpenCV's families all three.
+        Those that do not matter are kept as O = A, R = 0, E = 0.
     size_px
         (width, height).
     C, A, H, V, O, R, E
         (3,) each, read-only. C in metres; A and O unit vectors; H and V in pixels; R and E as published.
     cahvore_type
-        1 (perspective, linearity 1), 2 (fisheye, linearity 0) or 3 (``linearity`` as given); 0 for CAHV
-        and CAHVOR.
+        1 (perspective, linearity 1), 2 (fisheye, linearity 0) or 3 (``linearity`` as given); else 0.
     distortion
         (n,) OpenCV's coefficients in its order, 4 to 14 as the kind says; none of the CAHV family.
 
@@ -131,7 +129,7 @@ class CameraModel(ReadOnlyArrays):
     linearity: float = 1.0
     distortion: FloatArray = None  # type: ignore[assignment]  # 0 if not given
     _rows: FloatArray = field(init=False, repr=False)  # C, H, V, A, and the lens frame's x, y, z = O
-    _projection: Projection = field(init=False, repr=False)
+    projection: Projection = field(init=False, repr=False)  # what stays when the camera moves
 
     if TYPE_CHECKING:  # vectors may be given as lists
 
@@ -222,7 +220,7 @@ class CameraModel(ReadOnlyArrays):
         else:
             r, e = tuple(self.R.tolist()), tuple(self.E.tolist())
             lens = RoundLens(r, e, self.kind == "CAHVORE", self.linearity, slope)
-        self._set("_projection", Projection(lens, pixel_from_slope, slope_from_pixel))
+        self._set("projection", Projection(lens, pixel_from_slope, slope_from_pixel))
 
     @classmethod
     def normalised(
@@ -239,16 +237,11 @@ class CameraModel(ReadOnlyArrays):
         cahvore_type: int = 0,
         linearity: float = 1.0,
     ) -> tuple[CameraModel, float]:
-        """Return the model with A and O made unit vectors, and by how much that moves a pixel at most.
+        """Return the model with A and O made unit vectors, and by how many pixels that moves one at most.
 
-        Arguments as the class, A and O of any length but zero. The change, in pixels, is the largest over the
-        image, of points 1 m and 1 km away, against JPL's formulas with the vectors as given. It is infinite
-        if those give no pixel somewhere.
-
-        Raises
-        ------
-        ValueError
-            As the class, and if A or O is zero.
+        Arguments as the class, A and O of any length but zero (ValueError). The change is the largest over
+        the image, of points 1 m and 1 km away, against JPL's formulas with the vectors as given; infinite if
+        those give no pixel somewhere.
         """
         given = {"A": _vector("A", A)}
         if O is not None and "O" in letters_of(str(kind)):
@@ -296,16 +289,11 @@ class CameraModel(ReadOnlyArrays):
         ----------
         kind
             One of OpenCV's families, or CAHV, which has no ``distortion``.
-        size_px
-            (width, height).
         camera_matrix
             (3, 3) [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]; fx and fy of two signs mirror the image.
-        distortion
-            (n,) coefficients.
-        rotation
-            (3, 3) OpenCV's R: rows are the camera's x right, y down and z ahead in the frame of C.
-        C
-            (3,) where the camera is, metres: -R^T t of OpenCV's t.
+        rotation, C
+            (3, 3) OpenCV's R: rows are the camera's x right, y down and z ahead in the frame of C (3,), where
+            the camera is, metres: -R^T t of OpenCV's t.
 
         Raises
         ------
@@ -345,7 +333,7 @@ class CameraModel(ReadOnlyArrays):
     @property
     def lens(self) -> Lens:
         """The lens: what stays, with the plane of the image behind it, when the camera moves."""
-        return self._projection.lens
+        return self.projection.lens
 
     @property
     def moving(self) -> bool:
@@ -354,10 +342,7 @@ class CameraModel(ReadOnlyArrays):
 
     @property
     def limit_reason(self) -> str:
-        """Where the lens ends, as a sentence's end: "the lens folds at 61.2 degrees from its axis".
-
-        Empty if it has no end but that of its family.
-        """
+        """Where the lens ends, as a sentence's end; empty if it has no end but that of its family."""
         return self.lens.limit_reason
 
     @property
@@ -369,7 +354,7 @@ class CameraModel(ReadOnlyArrays):
     def camera_matrix(self) -> FloatArray:
         """(3, 3) [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] of a CAHV camera or one of OpenCV's families."""
         if self.kind in FREE:
-            return self._projection.pixel_from_slope
+            return self.projection.pixel_from_slope
         inner = np.stack([self.H, self.V]) @ self.rotation.T
         return np.triu(np.vstack([inner, [0.0, 0.0, 1.0]]))
 
@@ -386,7 +371,7 @@ class CameraModel(ReadOnlyArrays):
     def holds(self, pixel_px: ArrayLike, margin_px: float = 0.0) -> bool:
         """Return whether a pixel (2,) lies in the image, at least ``margin_px`` inside its outer border.
 
-        The border runs half a pixel outside the outer pixels' centres. Not-a-number lies outside.
+        That runs half a pixel outside the outer pixels' centres. Not-a-number lies outside.
         """
         x, y = np.asarray(pixel_px, dtype=np.float64)
         low, (width, height) = margin_px - 0.5, self.size_px
@@ -447,48 +432,34 @@ class CameraModel(ReadOnlyArrays):
 
         Points that have no pixel (see the class) come out as not-a-number.
         """
-        pixels, _, valid = self._project(points_m, False)
-        return pixels, valid
+        points = _as_rows(points_m, 3, "points")
+        pixels, _, valid = self.projection.project(points.reshape(-1, 3), self.C, self.lens_axes, False)
+        return pixels.reshape(*points.shape[:-1], 2), valid.reshape(points.shape[:-1])
 
     def project_jacobian(self, points_m: ArrayLike) -> tuple[FloatArray, FloatArray, np.ndarray]:
-        """Return pixels (..., 2), d pixel / d point (..., 2, 3) in px/m, and which are valid (...).
-
-        Points that have no pixel (see the class) come out as not-a-number.
-        """
-        return self._project(points_m, True)
-
-    def _project(self, points_m: ArrayLike, derivatives: bool) -> tuple[FloatArray, FloatArray, np.ndarray]:
+        """As ``project``, with d pixel / d point (..., 2, 3) in px/m between the two."""
         points = _as_rows(points_m, 3, "points")
         shape = points.shape[:-1]
-        pixels, jacobian, valid = self._projection.project(
-            points.reshape(-1, 3), self.C, self.lens_axes, derivatives
-        )
-        return (
-            pixels.reshape(*shape, 2),
-            jacobian.reshape(*shape, 2, 3) if derivatives else jacobian,
-            valid.reshape(shape),
-        )
+        pixels, rates, valid = self.projection.project(points.reshape(-1, 3), self.C, self.lens_axes, True)
+        return pixels.reshape(*shape, 2), rates.reshape(*shape, 2, 3), valid.reshape(shape)
 
     def ray(self, pixels_px: ArrayLike) -> Rays:
         """Return the rays through pixels (..., 2); a CAHVORE ray begins at the moved entrance point.
 
         Pixels that no ray of the lens lands on come out as not-a-number.
         """
-        return self._ray(pixels_px, False)[0]
+        return self._rays(pixels_px, False)[0]
 
     def ray_jacobian(self, pixels_px: ArrayLike) -> tuple[Rays, FloatArray, FloatArray]:
-        """Return the rays, d direction / d pixel (..., 3, 2) per px and d origin / d pixel (..., 3, 2), m/px.
-
-        Pixels that no ray of the lens lands on come out as not-a-number.
-        """
-        rays, d_directions, d_origins = self._ray(pixels_px, True)
+        """As ``ray``, with d direction / d pixel and d origin / d pixel (..., 3, 2), per px and m/px."""
+        rays, d_directions, d_origins = self._rays(pixels_px, True)
         shape = rays.valid.shape
         return rays, d_directions.reshape(*shape, 3, 2), d_origins.reshape(*shape, 3, 2)
 
-    def _ray(self, pixels_px: ArrayLike, derivatives: bool) -> tuple[Rays, FloatArray, FloatArray]:
+    def _rays(self, pixels_px: ArrayLike, derivatives: bool) -> tuple[Rays, FloatArray, FloatArray]:
         pixels = _as_rows(pixels_px, 2, "pixels")
         shape = pixels.shape[:-1]
-        origins, directions, valid, d_directions, d_origins = self._projection.rays(
+        origins, directions, valid, d_directions, d_origins = self.projection.rays(
             pixels.reshape(-1, 2), self.C, self.lens_axes, derivatives
         )
         rays = Rays(origins.reshape(*shape, 3), directions.reshape(*shape, 3), valid.reshape(shape))

@@ -141,33 +141,25 @@ def predict(model: CameraModel, points_m: FloatArray) -> Prediction:
     Points that have no pixel come out as not-a-number. Each number's values of all points lie side by side in
     memory, so that numpy's loops run along them.
     """
-    d = np.array(np.asarray(points_m).T, order="C")
-    d -= model.C[:, None]
+    points, axes = np.asarray(points_m, dtype=np.float64), model.lens_axes
+    pixels, d_points, valid = model.projection.forward(points, model.C, axes, True)
+    d = np.subtract(points.T, model.C[:, None], order="C")
     with np.errstate(all="ignore"):
-        pixels, d_step, d_points, valid = _predict(model, d)
-    if not valid.all():
-        for array in (pixels, d_step, d_points):
-            array[..., ~valid] = np.nan
+        d_step = _step_rates(model, d, pixels, d_points)
+    d_step[..., ~valid] = np.nan
     return Prediction(pixels.T, d_step.transpose(2, 0, 1), d_points.transpose(2, 0, 1), valid)
 
 
-def _predict(model: CameraModel, d: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, np.ndarray]:
-    """Pixels (2, n), d pixel / d step (2, p, n), d pixel / d point (2, 3, n), and which are valid (n,)."""
-    kind, lens, axes, free = model.kind, model.lens, model.lens_axes, model.kind in FREE
-    local = axes @ d
-    bent = lens.bend(local, True)
-    assert bent.rates is not None
-    both = np.stack([model.H, model.V])
-    q = axes[:2].T @ bent.slopes + axes[2][:, None]
+def _step_rates(model: CameraModel, d: FloatArray, pixels: FloatArray, d_points: FloatArray) -> FloatArray:
+    """d pixel / d step (2, p, n) of points d (3, n) from C, pixels (2, n), with their rates (2, 3, n)."""
+    kind, lens, axes = model.kind, model.lens, model.lens_axes
+    slopes = model.projection.slope_from_pixel @ np.concatenate([pixels, np.ones((1, d.shape[1]))])
+    q = axes[:2].T @ (slopes[:2] / slopes[2]) + axes[2][:, None]
     depth = model.A @ q
     q /= depth
-    pixels = both @ q
-    valid = bent.valid & (depth > 0.0) & np.isfinite(pixels).all(axis=0)
-    if not lens.curved:
-        valid &= model.A @ d > 0.0
+    both = np.stack([model.H, model.V])
     d_q = (both[..., None] - pixels[:, None] * model.A[:, None]) / depth
     by_slope = axes[:2] @ d_q
-    d_points = axes.T @ _chained(by_slope, bent.rates)
     d_step = np.zeros((2, len(parameter_names(kind)), d.shape[1]))
 
     def to(letter: str) -> FloatArray:
@@ -177,23 +169,20 @@ def _predict(model: CameraModel, d: FloatArray) -> tuple[FloatArray, FloatArray,
     np.negative(d_points, out=to("C"))
     np.multiply(-pixels[:, None], on_a @ q, out=to("A"))
     to("H")[0] = to("V")[1] = q
-    if kind != "CAHV":  # whose lens may turn about anything
-        d_turn = crossed_rows(q * depth, d_q) - crossed_rows(d, d_points)
-    if free:
+    if kind == "CAHV":
+        return d_step
+    d_turn = crossed_rows(q * depth, d_q) - crossed_rows(d, d_points)
+    bent = lens.coefficient_rates(axes @ d)
+    rates = by_slope[:, 0, None] * bent[0] + by_slope[:, 1, None] * bent[1]
+    if kind in FREE:
         (x, y, z), (_, fy, cy) = axes, model.camera_matrix[1]
         turns = np.stack([-on_a @ y, on_a @ x, cy / fy * (on_a @ x)], axis=1) @ axes
         to("A")[...] += turns @ d_turn
         to("V")[...] += (z @ d_turn)[:, None] * (-x / fy)[:, None]
-        to("D")[...] = _chained(by_slope, lens.coefficient_rates(local))
-    elif kind != "CAHV":
+        to("D")[...] = rates
+    else:
         np.matmul(np.cross(model.O, tangents(model.O)), d_turn, out=to("O"))
-        rates = _chained(by_slope, lens.coefficient_rates(local))
         to("R")[...] = rates[:, :2]
         if kind == "CAHVORE":
             to("E")[...] = rates[:, 2:]
-    return pixels, d_step, d_points, valid
-
-
-def _chained(by_slope: FloatArray, rates: FloatArray) -> FloatArray:
-    """Rates (2, k, n) of pixels from theirs to slopes (2, 2, n) and the slopes' (2, k, n)."""
-    return np.asarray(by_slope[:, 0, None] * rates[0] + by_slope[:, 1, None] * rates[1])
+    return d_step

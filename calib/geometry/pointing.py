@@ -9,13 +9,14 @@ letters are those of calib.geometry.reach.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from calib.errors import Unreachable
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.reach import EDGE, Axes, Ray, Triple, arm_points, axes_of, ray_of, why_not
+from calib.geometry.reach import EDGE, Arm
 from calib.geometry.rig import Mast
 from calib.geometry.rigid import FloatArray
 from calib.geometry.solutions import Solution, Solutions, check_here, order
@@ -27,7 +28,7 @@ _PARALLEL = 1e-3
 """``|cos k|`` below this: the axes are parallel to a milliradian, and the mast is not a pan/tilt head."""
 
 _FARTHEST_M = 1e9
-"""Coordinates from here on are taken for a mistake; their squares would overflow in the end."""
+"""Coordinates from here on are refused as a mistake; their squares would overflow in the end."""
 
 _MOST = 4
 """Pairs of joint angles that a target can have: as many as the quartic has roots."""
@@ -46,8 +47,6 @@ def solve(
 
     Parameters
     ----------
-    mast
-        Any two revolute axes.
     camera_in_head
         Camera model in the head frame (a rig camera that is ``on: head``).
     target_in_rover_m
@@ -94,14 +93,12 @@ def solve(
     """
     check_here(from_pan_rad, from_tilt_rad)
     target = np.asarray(target_in_rover_m, dtype=np.float64)
-    pixel = None if pixel_px is None else np.asarray(pixel_px, dtype=np.float64)
-    if target.ndim > 1 or (pixel is not None and pixel.ndim > 1):
+    pixel = np.asarray(camera_in_head.image_center_px if pixel_px is None else pixel_px, dtype=np.float64)
+    if target.ndim > 1 or pixel.ndim > 1:
         return solve_many(  # type: ignore[return-value]  # a type checker cannot tell the shapes apart
             mast, camera_in_head, target, pixel, from_pan_rad=from_pan_rad, from_tilt_rad=from_tilt_rad
         )
-    if pixel is None:
-        pixel = np.array(camera_in_head.image_center_px)
-    elif pixel.shape != (2,) or not np.isfinite(pixel).all():
+    if pixel.shape != (2,) or not np.isfinite(pixel).all():
         raise Unreachable("bad_pixel", f"pixel {pixel.tolist()} is not two finite numbers")
     rays = camera_in_head.ray(pixel)
     if not rays.valid:
@@ -110,8 +107,7 @@ def solve(
             f"pixel ({pixel[0]:g}, {pixel[1]:g}) has no ray in this "
             f"{camera_in_head.kind} camera{camera_in_head.why_no_ray}",
         )
-    ray = ray_of(rays.origins_m.tolist(), rays.directions.tolist())
-    return _solve(axes_of(mast), ray, target, from_pan_rad, from_tilt_rad)
+    return _solve(mast, rays.origins_m, rays.directions, target, from_pan_rad, from_tilt_rad, explain=True)
 
 
 def solve_many(
@@ -123,18 +119,10 @@ def solve_many(
     from_pan_rad: float = 0.0,
     from_tilt_rad: float = 0.0,
 ) -> Solutions:
-    """Return the joint angles of many targets, each as ``solve`` gives them for that target alone.
+    """Return the joint angles of many targets (..., 3), each as ``solve`` gives them for that target alone.
 
-    A target that cannot be reached, or is no target, does not stop the others: ``refused`` has its code.
-
-    Parameters
-    ----------
-    mast, camera_in_head, from_pan_rad, from_tilt_rad
-        As ``solve``; the head stands there before each target.
-    targets_in_rover_m
-        (..., 3) targets in the rover frame, metres.
-    pixels_px
-        (..., 2) wanted pixels (x, y), broadcast against the targets; the image centre if left out.
+    A target that cannot be reached, or is no target, does not stop the others: ``refused`` has its code. The
+    wanted pixels (..., 2) are broadcast against the targets.
 
     Raises
     ------
@@ -143,15 +131,14 @@ def solve_many(
         ``parallel_axes``, ``bad_joints``: as ``solve``.
     """
     check_here(from_pan_rad, from_tilt_rad)
-    axes = axes_of(mast)
     targets = np.asarray(targets_in_rover_m, dtype=np.float64)
     pixels = np.asarray(camera_in_head.image_center_px if pixels_px is None else pixels_px, dtype=np.float64)
-    for array, width, code, what in (
+    for array, width, code, name in (
         (targets, 3, "bad_target", "targets"),
         (pixels, 2, "bad_pixel", "pixels"),
     ):
         if array.ndim == 0 or array.shape[-1] != width:
-            raise Unreachable(code, f"{what} of shape {array.shape} where (..., {width}) is expected")
+            raise Unreachable(code, f"{name} of shape {array.shape} where (..., {width}) is expected")
     try:
         shape = np.broadcast_shapes(targets.shape[:-1], pixels.shape[:-1])
     except ValueError:
@@ -159,88 +146,75 @@ def solve_many(
             "bad_target",
             f"targets of shape {targets.shape} and pixels of shape {pixels.shape} do not go together",
         ) from None
-    rays = camera_in_head.ray(np.broadcast_to(pixels, (*shape, 2)).reshape(-1, 2))
-    each = zip(
-        np.broadcast_to(targets, (*shape, 3)).reshape(-1, 3),
-        rays.origins_m.tolist(),
-        rays.directions.tolist(),
-        rays.valid.tolist(),
-        strict=True,
-    )
-    found, refused = np.full((3, math.prod(shape), _MOST), np.nan), [""] * math.prod(shape)
-    for row, (target, origin_m, direction, valid) in enumerate(each):
-        if not valid:
-            refused[row] = "bad_pixel"
-            continue
+    rays = camera_in_head.ray(np.broadcast_to(pixels, (*shape, 2)))
+    every_target = np.broadcast_to(targets, (*shape, 3))
+    found = np.full((3, *shape, _MOST), np.nan)
+    refused = np.full(shape, "", dtype="<U16")
+    for at in np.ndindex(shape):
         try:
-            ray = ray_of(origin_m, direction)
-            some = _solve(axes, ray, target, from_pan_rad, from_tilt_rad, explain=False)
+            if not rays.valid[at]:
+                raise Unreachable("bad_pixel", "the pixel has no ray")
+            solutions = _solve(
+                mast, rays.origins_m[at], rays.directions[at], every_target[at],
+                from_pan_rad, from_tilt_rad, explain=False,
+            )  # fmt: skip
         except Unreachable as refusal:
             if refusal.code == "parallel_axes":  # the mast's fault, not the target's
                 raise
-            refused[row] = refusal.code
+            refused[at] = refusal.code
             continue
-        for column, one in enumerate(some[:_MOST]):
-            found[:, row, column] = one.pan_rad, one.tilt_rad, one.range_m
-    pan_rad, tilt_rad, range_m = found.reshape(3, *shape, _MOST)
-    codes = np.array(refused, dtype=np.str_).reshape(shape)
-    for rows in (pan_rad, tilt_rad, range_m, codes):
-        rows.setflags(write=False)
-    return Solutions(pan_rad, tilt_rad, range_m, codes)
+        for column, one in enumerate(solutions[:_MOST]):
+            found[(slice(None), *at, column)] = one.pan_rad, one.tilt_rad, one.range_m
+    for array in (found, refused):
+        array.setflags(write=False)
+    pan_rad, tilt_rad, range_m = found
+    return Solutions(pan_rad, tilt_rad, range_m, refused)
 
 
 def _solve(
-    axes: Axes,
-    ray: Ray,
+    mast: Mast,
+    origin_m: FloatArray,
+    direction: FloatArray,
     target: FloatArray,
     from_pan_rad: float,
     from_tilt_rad: float,
-    explain: bool = True,
+    explain: bool,
 ) -> list[Solution]:
     """Solve for one target; a refusal says by how much if it is to explain itself, which takes a search."""
-    x, y, z = _target_in_mast(axes, target)
-    if abs(axes.cos_k) < _PARALLEL:
+    if target.shape != (3,):
         raise Unreachable(
-            "parallel_axes", f"pan and tilt axes are parallel (cos k = {axes.cos_k:.2g}): not a pan/tilt head"
+            "bad_target", f"target of shape {target.shape} where three coordinates are expected"
+        )
+    if not (np.abs(target) < _FARTHEST_M).all():
+        raise Unreachable("bad_target", f"target {target.tolist()} is not three finite numbers below 1e9 m")
+    x, y, z = ((target - mast.translation_m) @ mast.rover_from_mast.rotation).tolist()
+    k = mast.axis_twist_rad
+    arm = Arm(mast.axis_offset_m, math.sin(k), math.cos(k), _triple(origin_m), _triple(direction))
+    if abs(arm.cos_k) < _PARALLEL:
+        raise Unreachable(
+            "parallel_axes", f"pan and tilt axes are parallel (cos k = {arm.cos_k:.2g}): not a pan/tilt head"
         )
     rho = math.hypot(x, y)
     on_axis = rho <= EDGE * math.hypot(rho, z)
     azimuth = math.atan2(y, x)
-    (cx, _, cz), (dx, _, dz) = ray.c, ray.d
+    (cx, _, cz), (dx, _, dz) = arm.c, arm.d
     found: list[Solution] = []
-    for u_x, u_y, s in arm_points(axes, ray, rho, z):
+    for u_x, u_y, s in arm.points(rho, z):
         # q = Rot(y,tilt) w turns w_x, w_z in their plane; q_y = w_y.
-        q_x = u_x - axes.a
-        q_z = axes.cos_k * z - axes.sin_k * u_y
-        w_x = cx + s * dx
-        w_z = cz + s * dz
+        q_x, q_z = u_x - arm.a, arm.cos_k * z - arm.sin_k * u_y
+        w_x, w_z = cx + s * dx, cz + s * dz
         tilt = math.atan2(q_x * w_z - q_z * w_x, q_x * w_x + q_z * w_z)
         pan = _wrapped(from_pan_rad if on_axis else azimuth - math.atan2(u_y, u_x))
         if not any(_same(pan, other.pan_rad) and _same(tilt, other.tilt_rad) for other in found):
             found.append(Solution(pan, _wrapped(tilt), s))
     if not found:
-        raise why_not(axes, ray, rho, z, explain)
-    if len(found) > 1:
-        found.sort(key=lambda one: order(one, from_pan_rad, from_tilt_rad))
-    return found
+        raise arm.why_not(rho, z, explain)
+    return sorted(found, key=lambda one: order(one, from_pan_rad, from_tilt_rad))
 
 
-def _target_in_mast(axes: Axes, target: FloatArray) -> Triple:
-    if target.shape != (3,):
-        raise Unreachable(
-            "bad_target", f"target of shape {target.shape} where three coordinates are expected"
-        )
-    x, y, z = target.tolist()
-    if not (abs(x) < _FARTHEST_M and abs(y) < _FARTHEST_M and abs(z) < _FARTHEST_M):
-        raise Unreachable("bad_target", f"target {[x, y, z]} is not three finite numbers below 1e9 m")
-    tx, ty, tz = axes.translation
-    x, y, z = x - tx, y - ty, z - tz
-    r0, r1, r2 = axes.rows
-    return (
-        r0[0] * x + r1[0] * y + r2[0] * z,
-        r0[1] * x + r1[1] * y + r2[1] * z,
-        r0[2] * x + r1[2] * y + r2[2] * z,
-    )
+def _triple(vector: Sequence[float] | FloatArray) -> tuple[float, float, float]:
+    x, y, z = vector
+    return float(x), float(y), float(z)
 
 
 def _wrapped(angle_rad: float) -> float:

@@ -13,31 +13,25 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import isfinite, nan
 
 import numpy as np
 
-from calib.geometry.lenses import Lens
+from calib.geometry.lenses.opencv import OpencvLens
+from calib.geometry.lenses.round import RoundLens
 from calib.geometry.rigid import FloatArray, ReadOnlyArrays
 
 CHUNK = 8192
 """Points at a time: some ten rows of them stay in a core's own cache."""
 
-Rays = tuple[FloatArray, FloatArray, np.ndarray, FloatArray, FloatArray]
+Lens = OpencvLens | RoundLens
 
 
 @dataclass(frozen=True, eq=False)
 class Projection(ReadOnlyArrays):
     """A lens with the plane behind it.
 
-    Attributes
-    ----------
-    lens
-        Distortion, entrance point and reach.
-    pixel_from_slope
-        (3, 3): H, V and A in the lens frame, as rows; the camera matrix where the lens frame's z is A.
-    slope_from_pixel
-        (3, 3): its inverse.
+    ``pixel_from_slope`` (3, 3) has H, V and A in the lens frame as rows: the camera matrix where the lens
+    frame's z is A; ``slope_from_pixel`` is its inverse.
     """
 
     lens: Lens
@@ -55,52 +49,52 @@ class Projection(ReadOnlyArrays):
         count = len(points)
         pixels, valid = np.empty((count, 2)), np.empty(count, dtype=bool)
         jacobian = np.empty((count if derivatives else 0, 2, 3))
-        with np.errstate(all="ignore"):
-            for part in _chunks(count):
-                self._project(points[part], center, axes, pixels[part], jacobian[part], valid[part])
+        for part in _chunks(count):
+            seen, rates, valid[part] = self.forward(points[part], center, axes, derivatives)
+            pixels[part] = seen.T
+            if derivatives:
+                jacobian[part] = rates.transpose(2, 0, 1)
         return pixels, jacobian, valid
 
-    def _project(
-        self,
-        points: FloatArray,
-        center: FloatArray,
-        axes: FloatArray,
-        pixels: FloatArray,
-        jacobian: FloatArray,
-        valid: np.ndarray,
-    ) -> None:
-        """Fill pixels and validity of one chunk, and the Jacobian if it has rows."""
+    @np.errstate(all="ignore")
+    def forward(
+        self, points: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool
+    ) -> tuple[FloatArray, FloatArray, np.ndarray]:
+        """Return the same of all points at once, as arrays (2, n), (2, 3, n) and (n,)."""
         k = self.pixel_from_slope
         local = axes @ np.subtract(points.T, center[:, None], order="C")
-        bent = self.lens.bend(local, len(jacobian) > 0)
+        bent = self.lens.bend(local, derivatives)
         seen = k[:, :2] @ bent.slopes
         seen += k[:, 2:]
-        depth = seen[2]
-        np.greater(depth if self.lens.curved else np.minimum(depth, k[2] @ local), 0.0, out=valid)
-        valid &= bent.valid
-        per_depth = np.divide(1.0, depth, out=depth)
-        np.multiply(seen[:2], per_depth, out=pixels.T)
-        if not isfinite(np.vdot(pixels, pixels)):
-            valid &= np.isfinite(pixels).all(axis=1)
+        valid = bent.valid & (seen[2] > 0.0)
+        if not self.lens.curved:
+            valid &= k[2] @ local > 0.0
+        per_depth = 1.0 / seen[2]
+        pixels = seen[:2] * per_depth
+        valid &= np.isfinite(pixels).all(axis=0)
+        jacobian = np.empty((2, 3, 0))
         if bent.rates is not None:
             # Of the plane's three rows by the point, turned by the axes: one product of matrices.
             turned = np.einsum("is,jl->ijsl", k[:, :2], axes.T).reshape(9, 6)
             rows = (turned @ bent.rates.reshape(6, -1)).reshape(3, 3, -1)
             if k[2, :2].any():
-                rows[:2] -= pixels.T[:, None] * rows[2]
-            np.multiply(rows[:2], per_depth, out=jacobian.transpose(1, 2, 0))
+                rows[:2] -= pixels[:, None] * rows[2]
+            jacobian = rows[:2]
+            jacobian *= per_depth
         if not valid.all():
-            pixels[~valid] = nan
-            jacobian[~valid[: len(jacobian)]] = nan
+            pixels[:, ~valid] = np.nan
+            jacobian[..., ~valid[: jacobian.shape[2]]] = np.nan
+        return pixels, jacobian, valid
 
-    def rays(self, pixels: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool) -> Rays:
+    def rays(
+        self, pixels: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool
+    ) -> tuple[FloatArray, FloatArray, np.ndarray, FloatArray, FloatArray]:
         """Return origins (n, 3), directions (n, 3) and validity (n,) of the rays of pixels (n, 2).
 
         Then d direction / d pixel and d origin / d pixel, (n, 3, 2) each if wanted, else with no rows.
         """
-        count = len(pixels)
+        count, rows = len(pixels), len(pixels) if derivatives else 0
         origins, directions, valid = np.empty((count, 3)), np.empty((count, 3)), np.empty(count, dtype=bool)
-        rows = count if derivatives else 0
         d_directions, d_origins = np.empty((rows, 3, 2)), np.zeros((rows, 3, 2))
         filled = (origins, directions, valid, d_directions, d_origins)
         with np.errstate(all="ignore"):
@@ -128,13 +122,10 @@ class Projection(ReadOnlyArrays):
         np.divide(1.0, per_w, out=per_w)
         slopes *= per_w
         ray = lens.unbend(slopes, len(d_directions) > 0)
-        local = ray.directions
-        valid &= ray.valid
+        valid &= ray.valid & np.isfinite(ray.directions).all(axis=0)
         if not lens.curved:
-            valid &= self.pixel_from_slope[2] @ local > 0.0
-        if not isfinite(np.vdot(local, local)):
-            valid &= np.isfinite(local).all(axis=0)
-        np.matmul(local.T, axes, out=directions)
+            valid &= self.pixel_from_slope[2] @ ray.directions > 0.0
+        np.matmul(ray.directions.T, axes, out=directions)
         origins[...] = center
         if ray.shift_m is not None:
             origins += ray.shift_m[:, None] * axes[2]
@@ -152,11 +143,8 @@ class Projection(ReadOnlyArrays):
         if ray.shift_rates is not None:
             d_origins[...] = axes[2][:, None] * by_pixel(ray.shift_rates[None])[0].T[:, None]
         if not valid.all():
-            lost = ~valid
-            origins[lost] = nan
-            directions[lost] = nan
-            d_directions[lost[: len(d_directions)]] = nan
-            d_origins[lost[: len(d_origins)]] = nan
+            for array in (origins, directions, d_directions, d_origins):
+                array[~valid[: len(array)]] = np.nan
 
 
 def _chunks(count: int) -> Iterator[slice]:
@@ -164,6 +152,7 @@ def _chunks(count: int) -> Iterator[slice]:
     return (slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK))
 
 
+@np.errstate(all="ignore")
 def project_as_published(
     points_m: FloatArray,
     C: FloatArray,
@@ -179,25 +168,24 @@ def project_as_published(
 
     Source: ``cmod_cahvor_3d_to_2d`` and ``cmod_cahvore_3d_to_2d_general``; here nothing is refused.
     """
-    with np.errstate(all="ignore"):
-        p = points_m - C
-        zeta = p @ O
-        across = p - zeta[:, None] * O
-        lam = np.maximum(np.linalg.norm(across, axis=1), 1e-12)
-        if linearity is None:
-            chi = lam / zeta
-        else:
-            theta = np.arctan2(lam, zeta)
-            for _ in range(20):
-                sine, cosine, lag = np.sin(theta), np.cos(theta), theta - np.sin(theta)
-                e = E[0] + E[1] * theta**2 + E[2] * theta**4
-                e_rate = 2.0 * E[1] * theta + 4.0 * E[2] * theta**3
-                rate = zeta * cosine + lam * sine - (1.0 - cosine) * e - lag * e_rate
-                step = (zeta * sine - lam * cosine - lag * e) / rate
-                theta = theta - step
-            theta[~(np.abs(step) < 1e-9)] = np.nan  # no ray was found, or none that is sure
-            angle = linearity * theta
-            chi = theta if linearity == 0.0 else (np.tan if linearity > 0.0 else np.sin)(angle) / linearity
-        mu = R[0] + R[1] * chi**2 + R[2] * chi**4
-        bent = (lam / chi)[:, None] * O + (1.0 + mu)[:, None] * across
-        return np.asarray(np.stack([bent @ H, bent @ V], axis=-1) / (bent @ A)[:, None])
+    p = points_m - C
+    zeta = p @ O
+    across = p - zeta[:, None] * O
+    lam = np.maximum(np.linalg.norm(across, axis=1), 1e-12)
+    if linearity is None:
+        chi = lam / zeta
+    else:
+        theta = np.arctan2(lam, zeta)
+        for _ in range(20):
+            sine, cosine, lag = np.sin(theta), np.cos(theta), theta - np.sin(theta)
+            e = E[0] + E[1] * theta**2 + E[2] * theta**4
+            e_rate = 2.0 * E[1] * theta + 4.0 * E[2] * theta**3
+            rate = zeta * cosine + lam * sine - (1.0 - cosine) * e - lag * e_rate
+            step = (zeta * sine - lam * cosine - lag * e) / rate
+            theta = theta - step
+        theta[~(np.abs(step) < 1e-9)] = np.nan  # no ray was found, or none that is sure
+        angle = linearity * theta
+        chi = theta if linearity == 0.0 else (np.tan if linearity > 0.0 else np.sin)(angle) / linearity
+    mu = R[0] + R[1] * chi**2 + R[2] * chi**4
+    bent = (lam / chi)[:, None] * O + (1.0 + mu)[:, None] * across
+    return np.asarray(np.stack([bent @ H, bent @ V], axis=-1) / (bent @ A)[:, None])

@@ -65,8 +65,8 @@ class AxisJoint:
     harmonics_rad
         (c_i, s_i) of the first and second harmonic over a turn; may be shorter.
     backlash_rad
-        Full width of the play between encoder and load. An estimate of one that is none may be negative; a
-        mast file holds none such.
+        Full width of the play between encoder and load. An estimate of none may be negative; a mast file has
+        no such value.
 
     Raises
     ------
@@ -128,19 +128,12 @@ class AxisJoint:
         return found
 
     def goal_rad(self, true_rad: float, read_rad: float, approach: float = 0.0, turn: int = 0) -> float:
-        """Return the reading to send an axis to that stands at a reading, so that it comes to a true angle.
+        """Return the reading to send an axis to, which is at a reading and approach, to reach a true angle.
 
-        Parameters
-        ----------
-        true_rad
-            The true angle wanted.
-        read_rad, approach
-            Where it stands, and from which side it came there.
-        turn
-            1 or -1 for a head that comes to this goal from smaller or from larger angles by itself.
+        ``turn`` is 1 or -1 for a head that comes to this goal from smaller or from larger angles by itself.
         """
-        wanted, stands = self.read_rad(true_rad), self._taken_up(read_rad, approach)
-        turn = turn or (wanted > stands) - (wanted < stands)
+        wanted, present = self.read_rad(true_rad), self._taken_up(read_rad, approach)
+        turn = turn or (wanted > present) - (wanted < present)
         return wanted + 0.5 * turn * self.backlash_rad if turn else read_rad
 
     def slope(self, read_rad: _Angle, approach: float | FloatArray = 0.0) -> _Angle:
@@ -148,10 +141,7 @@ class AxisJoint:
         return self._slope(self._taken_up(read_rad, approach))
 
     def rates(self, read_rad: ArrayLike, approach: ArrayLike = 0) -> FloatArray:
-        """Return (..., 5): how the true angle changes with the numbers `AXIS_NAMES`, the reading held.
-
-        ``read_rad`` and ``approach`` are (...), broadcast against each other.
-        """
+        """Return (..., 5): how the true angle changes with the numbers `AXIS_NAMES`, the reading fixed."""
         side = np.asarray(approach, dtype=np.float64)
         at = np.asarray(read_rad, dtype=np.float64) - 0.5 * side * self.backlash_rad
         slack = -0.5 * side * self._slope(at)
@@ -236,10 +226,8 @@ class Mast(ReadOnlyArrays):
 
     Attributes
     ----------
-    translation_m
-        (3,) origin of the mast frame in the rover frame, metres.
-    rotation_rad
-        (3,) θx, θy, θz of the mast frame in the rover frame, radians.
+    translation_m, rotation_rad
+        (3,) origin of the mast frame in the rover frame, metres, and θx, θy, θz, radians.
     axis_offset_m, axis_twist_rad
         Length and twist of the common perpendicular from the pan axis to the tilt axis.
 
@@ -268,22 +256,19 @@ class Mast(ReadOnlyArrays):
 
     def mast_from_head(self, pan_rad: float, tilt_rad: float) -> Rigid:
         """Return the moving part: head frame in the mast frame (paper eq. (8), with a and k)."""
-        pan = rot_z(pan_rad)
-        return Rigid(
-            pan @ rot_x(self.axis_twist_rad) @ rot_y(tilt_rad),
-            pan @ np.array([self.axis_offset_m, 0.0, 0.0]),
-        )
+        return self.rover_from_mast.inverse @ self.rover_from_head(pan_rad, tilt_rad)
 
     def rover_from_head(self, pan_rad: float, tilt_rad: float) -> Rigid:
         """Return the head frame in the rover frame at true joint angles, radians."""
-        return self.rover_from_mast @ self.mast_from_head(pan_rad, tilt_rad)
+        head = gimbal(numbers_of(self), pan_rad, tilt_rad)
+        return Rigid(head.rotation, head.translation_m)
 
 
 @dataclass(frozen=True, eq=False)
 class RigCamera:
     """A camera of a rig: its model in the frame of the thing it is mounted ``on``.
 
-    ``sensor_mode`` is the one that its pictures were calibrated in; None if nothing says so.
+    ``sensor_mode`` is the one that its pictures were calibrated in; None if not known.
     """
 
     on: Literal["head", "rover"]
@@ -295,8 +280,8 @@ class RigCamera:
 class Rig:
     """A mast with its cameras: what a mast file holds.
 
-    ``stereo`` maps a pair name to its (left, right) camera names. ``joints`` is what the head's readings are
-    wrong by: all else here speaks of true angles. ``fit`` and ``provenance`` are carried through unread.
+    ``stereo`` maps a pair name to its (left, right) camera names. ``joints`` are the errors of the head's
+    readings: all other angles are true ones. ``fit`` and ``provenance`` are carried through unread.
     """
 
     name: str
@@ -319,10 +304,7 @@ class Rig:
     def camera_in_rover(self, name: str, pan_rad: float, tilt_rad: float) -> CameraModel:
         """Return camera ``name`` in the rover frame at true joint angles; body cameras ignore them.
 
-        Raises
-        ------
-        KeyError
-            If the rig has no such camera.
+        Raises KeyError if the rig has no such camera.
         """
         camera = self.cameras[name]
         if camera.on == "rover":
@@ -338,7 +320,7 @@ MAST_NAMES = (
 )
 
 MAST_FREE = {4: (0, 1, 2, 5), 6: (0, 1, 2, 3, 4, 5), 8: (0, 1, 2, 3, 4, 5, 6, 7)}
-"""Which of the mast's eight numbers a fit of so many parameters moves; 4 is the mast taken as vertical."""
+"""Which of the mast's eight numbers a fit of so many parameters moves; 4 is a vertical mast."""
 
 
 def mast_of(numbers: FloatArray) -> Mast:
@@ -404,7 +386,7 @@ def joint_twists(
     read_rad: Pair | FloatArray,
     approach: Approach | FloatArray,
 ) -> FloatArray:
-    """Return (..., 12, 6): how the head moves with the ten numbers of `JOINTS_NAMES`, the readings held, and
+    """Return (..., 12, 6): how the head moves with the ten numbers of `JOINTS_NAMES`, the readings fixed, and
     with pan's and tilt's reading."""
     by_angles = head.twists[..., 8:, :]
     axes: list[Any] = list(zip((joints.pan, joints.tilt), read_rad, approach, strict=True))

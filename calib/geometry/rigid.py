@@ -19,13 +19,7 @@ IntArray = NDArray[np.int64]
 
 
 def frozen_array(values: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    """Return a read-only float64 copy of ``values``, which must be finite and of exactly ``shape``.
-
-    Raises
-    ------
-    ValueError
-        If the shape differs or a value is not finite.
-    """
+    """Return a read-only float64 copy of ``values``; ValueError unless finite and of exactly ``shape``."""
     array = np.array(values, dtype=np.float64)
     if array.shape != shape:
         raise ValueError(f"shape {array.shape} where {shape} is expected")
@@ -111,17 +105,9 @@ def quaternion_of(rotation: FloatArray) -> list[float]:
 
 def tangents(axis: FloatArray) -> FloatArray:
     """Return two unit vectors (2, 3) that make right-handed axes with a unit vector (3,), the third."""
-    x, y, z = axis.tolist()  # as np.cross, in a tenth of the time
-    least = (abs(x), abs(y), abs(z))
-    if least[0] <= least[1] and least[0] <= least[2]:
-        p, q, r = 0.0, z, -y
-    elif least[1] <= least[2]:
-        p, q, r = -z, 0.0, x
-    else:
-        p, q, r = y, -x, 0.0
-    size = math.sqrt(p * p + q * q + r * r)
-    p, q, r = p / size, q / size, r / size
-    return np.array([[p, q, r], [y * r - z * q, z * p - x * r, x * q - y * p]])
+    first = crossed(axis, np.eye(3)[np.abs(axis).argmin()])
+    first /= math.sqrt(first @ first)
+    return np.array([first, crossed(axis, first)])
 
 
 NO_ROTATION = 1e-6
@@ -132,17 +118,8 @@ NO_ROTATION = 1e-6
 class Rigid(ReadOnlyArrays):
     """A rigid transform ``b_from_a``: x_in_b = rotation @ x_in_a + translation_m.
 
-    Attributes
-    ----------
-    rotation
-        (3, 3), orthonormal with determinant +1.
-    translation_m
-        (3,), the origin of a in b, metres.
-
-    Raises
-    ------
-    ValueError
-        If the rotation is none (to 1e-6), or a number is not finite.
+    The rotation (3, 3) is orthonormal with determinant +1, to 1e-6, else ValueError; the translation (3,) is
+    the origin of a in b, metres.
     """
 
     rotation: FloatArray
@@ -150,8 +127,8 @@ class Rigid(ReadOnlyArrays):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "rotation", frozen_array(self.rotation, (3, 3)))
-        off = _off_rotation(self.rotation)
-        if not off <= NO_ROTATION:
+        off = float(np.abs(self.rotation @ self.rotation.T - np.eye(3)).max())
+        if not off <= NO_ROTATION or np.linalg.det(self.rotation) < 0.0:
             raise ValueError(
                 f"{self.rotation.tolist()} is no rotation: it stretches or shears by {off:.2g}, or mirrors"
             )
@@ -188,20 +165,6 @@ class Rigid(ReadOnlyArrays):
             and np.array_equal(self.rotation, other.rotation)
             and np.array_equal(self.translation_m, other.translation_m)
         )
-
-
-def _off_rotation(matrix: FloatArray) -> float:
-    """How far a matrix (3, 3) is from turning: rows of length 1, at right angles, the third their product."""
-    (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
-    off: float = max(
-        abs(a * a + b * b + c * c - 1.0),
-        abs(d * d + e * e + f * f - 1.0),
-        abs(a * d + b * e + c * f),
-        abs(b * f - c * e - g),
-        abs(c * d - a * f - h),
-        abs(a * e - b * d - i),
-    )
-    return off
 
 
 def carried_covariance(covariance: FloatArray, now_from_then: Rigid) -> FloatArray:

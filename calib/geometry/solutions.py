@@ -15,14 +15,10 @@ from calib.geometry.rigid import FloatArray, ReadOnlyArrays
 
 @dataclass(frozen=True, slots=True)
 class Solution:
-    """Joint angles that put the target on the pixel.
+    """Joint angles that put the target on the pixel, and its range from the ray's origin.
 
-    Attributes
-    ----------
-    pan_rad, tilt_rad
-        In (-π, π] from ``solve``; ``choose`` may return them a whole turn away.
-    range_m
-        From the ray's origin (the camera's C, or its moved entrance point) to the target.
+    The angles are in (-π, π] from ``solve``; ``choose`` may return them a whole turn away. The ray begins at
+    the camera's C, or its moved entrance point.
     """
 
     pan_rad: float
@@ -91,8 +87,8 @@ def ordered(
     from_pan_rad, from_tilt_rad
         Where the head is now, as read.
     read
-        The head's readings at a solution's true angles: of these are the limits and the motion. By default
-        joints read true.
+        The head's readings at a solution's true angles: limits and motion are of these. By default joints
+        read true.
 
     Raises
     ------
@@ -102,7 +98,8 @@ def ordered(
         is no solution to choose from.
     """
     check_here(from_pan_rad, from_tilt_rad)
-    for joint, (low, high) in (("pan", pan_limits_rad), ("tilt", tilt_limits_rad)):
+    limits = (pan_limits_rad, tilt_limits_rad)
+    for joint, (low, high) in zip(("pan", "tilt"), limits, strict=True):
         if not low <= high:  # not a number either
             raise Unreachable(
                 "bad_joints",
@@ -115,34 +112,33 @@ def ordered(
             raise Unreachable(
                 "bad_joints", f"a solution has pan {one.pan_rad} and tilt {one.tilt_rad} rad: no angles"
             )
+    turns = (0.0, math.tau, -math.tau)
     turned = [
-        Solution(one.pan_rad + pan_turn, one.tilt_rad + tilt_turn, one.range_m)
+        Solution(one.pan_rad + pan, one.tilt_rad + tilt, one.range_m)
         for one in solutions
-        for pan_turn in (0.0, math.tau, -math.tau)
-        for tilt_turn in (0.0, math.tau, -math.tau)
+        for pan in turns
+        for tilt in turns
     ]
 
-    def angles(one: Solution) -> tuple[float, float]:
-        return (one.pan_rad, one.tilt_rad) if read is None else read(one)
+    def beyond(one: Solution) -> list[float]:
+        """By how much each angle is outside its limits; 0 inside."""
+        return [
+            max(low - angle, angle - high, 0.0)
+            for angle, (low, high) in zip(_readings(one, read), limits, strict=True)
+        ]
 
-    def excess(one: Solution) -> tuple[float, float]:
-        pan_rad, tilt_rad = angles(one)
-        return _beyond(pan_rad, pan_limits_rad), _beyond(tilt_rad, tilt_limits_rad)
-
-    inside = [one for one in turned if excess(one) == (0.0, 0.0)]
+    inside = [one for one in turned if not any(beyond(one))]
     if inside:
         return sorted(inside, key=lambda one: order(one, from_pan_rad, from_tilt_rad, read))
-    pan_rad, tilt_rad = angles(min(turned, key=lambda one: max(excess(one))))
+    nearest = min(turned, key=lambda one: max(beyond(one)))
+    each = zip(("pan", "tilt"), _readings(nearest, read), beyond(nearest), limits, strict=True)
     raise Unreachable(
         "outside_limits",
         " and ".join(
-            f"{joint} {angle:.6g} rad is {_beyond(angle, limits):.3g} rad beyond the limit "
-            f"{limits[0] if angle < limits[0] else limits[1]:.6g} rad"
-            for joint, angle, limits in (
-                ("pan", pan_rad, pan_limits_rad),
-                ("tilt", tilt_rad, tilt_limits_rad),
-            )
-            if _beyond(angle, limits) > 0.0
+            f"{joint} {angle:.6g} rad is {excess:.3g} rad beyond the limit "
+            f"{low if angle < low else high:.6g} rad"
+            for joint, angle, excess, (low, high) in each
+            if excess > 0.0
         ),
     )
 
@@ -151,7 +147,7 @@ def check_here(from_pan_rad: float, from_tilt_rad: float) -> None:
     """Refuse joint angles that are not finite."""
     if not (math.isfinite(from_pan_rad) and math.isfinite(from_tilt_rad)):
         raise Unreachable(
-            "bad_joints", f"the head stands at pan {from_pan_rad}, tilt {from_tilt_rad} rad: no angles"
+            "bad_joints", f"the head is at pan {from_pan_rad}, tilt {from_tilt_rad} rad: no angles"
         )
 
 
@@ -163,10 +159,9 @@ def order(
 ) -> tuple[bool, float]:
     """Return the key by which solutions are sorted; present angles are readings if ``read`` is given."""
     upright = abs(math.remainder(one.tilt_rad, math.tau)) <= 0.5 * math.pi
-    pan_rad, tilt_rad = (one.pan_rad, one.tilt_rad) if read is None else read(one)
+    pan_rad, tilt_rad = _readings(one, read)
     return not upright, max(abs(pan_rad - from_pan_rad), abs(tilt_rad - from_tilt_rad))
 
 
-def _beyond(angle_rad: float, limits_rad: tuple[float, float]) -> float:
-    """Return by how much the angle is outside the limits; 0 inside."""
-    return max(limits_rad[0] - angle_rad, angle_rad - limits_rad[1], 0.0)
+def _readings(one: Solution, read: Callable[[Solution], tuple[float, float]] | None) -> tuple[float, float]:
+    return (one.pan_rad, one.tilt_rad) if read is None else read(one)

@@ -51,10 +51,10 @@ def test_a_mast_whose_axes_are_no_numbers_is_refused_by_name(name: str, bad: flo
 @pytest.mark.parametrize("bad", NO_NUMBERS)
 def test_a_head_that_stands_nowhere_has_no_next_angles(bad: float) -> None:
     for here in ({"from_pan_rad": bad}, {"from_tilt_rad": bad}):
-        with pytest.raises(Unreachable, match="the head stands at") as refused:
+        with pytest.raises(Unreachable, match="the head is at") as refused:
             solve(MAST, HEAD, [3.0, 0.0, -1.0], **here)
         assert refused.value.code == "bad_joints"
-        with pytest.raises(Unreachable, match="the head stands at"):
+        with pytest.raises(Unreachable, match="the head is at"):
             choose([Solution(0.1, 0.0, 3.0)], (-1.0, 1.0), (-1.0, 1.0), **here)
 
 

@@ -1,4 +1,9 @@
-"""The interface of all lenses: from points in the lens frame to slopes, and from slopes to rays.
+"""What all lenses share: from points in the lens frame to slopes, and from slopes to rays.
+
+A lens has ``bend`` and ``unbend`` (with derivatives if wanted), ``coefficient_rates`` in the order of a
+camera's step, ``curved`` (slopes follow the angle, so a ray may be at a right angle to the axis and more),
+``moving`` (so does the entrance point), ``limit_rad`` (up to where it reaches in every direction) and
+``limit_reason`` (where it ends, as the end of a sentence; empty if that is where its family ends).
 
 The lens frame has its origin at C. A point (a, b, w) of it is seen at the *slopes* (u, v), those of the
 straight ray that a pinhole would need to land on the same pixel. `calib.geometry.projection` makes pixels of
@@ -8,7 +13,7 @@ rows without a result come back with ``valid`` False and any number at all.
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -40,42 +45,6 @@ class Unbent(NamedTuple):
     rates: FloatArray | None = None
     shift_m: FloatArray | None = None
     shift_rates: FloatArray | None = None
-
-
-class Lens(Protocol):
-    """What a camera needs of its lens; shared by all copies of a camera that is moved."""
-
-    @property
-    def moving(self) -> bool:
-        """Whether the entrance point moves with a ray's angle."""
-        ...
-
-    @property
-    def curved(self) -> bool:
-        """Whether slopes follow the angle, so that a ray may be at a right angle to the axis and more."""
-        ...
-
-    @property
-    def limit_rad(self) -> float:
-        """The angle from the axis up to which the lens reaches in every direction."""
-        ...
-
-    @property
-    def limit_reason(self) -> str:
-        """Where the lens ends, as the end of a sentence; empty if that is where its family ends."""
-        ...
-
-    def bend(self, local_m: FloatArray, derivatives: bool = False) -> Bent:
-        """Return where points (3, n), rows a, b, w of the lens frame, are seen."""
-        ...
-
-    def unbend(self, slopes: FloatArray, derivatives: bool = False) -> Unbent:
-        """Return the rays that land on slopes (2, n)."""
-        ...
-
-    def coefficient_rates(self, local_m: FloatArray) -> FloatArray:
-        """Return d slope / d coefficient (2, k, n) of points (3, n), in the order of a camera's step."""
-        ...
 
 
 def polynomial(coefficients: tuple[float, ...], y: FloatArray) -> FloatArray:

@@ -46,25 +46,16 @@ _TERMS = 9
 _SETTLED_RAD = 1e-9
 """Newton stops after a step below this: the derivative is good to that part of itself."""
 
-_SMALL_TURN_RAD = 0.02
-"""Up to here a sine by its series to the fifth power is exact to rounding."""
-
 _NODES = 257
 """Angles at which the slow search for a ray checks for a change of sign."""
 
 
 @dataclass(frozen=True)
 class Entrance:
-    """The entrance point of one lens.
+    """The entrance point of one lens, e0 to e2.
 
-    Attributes
-    ----------
-    e
-        e0, e1, e2.
-    image_rad, limit_rad
-        The largest angle inside the image, and the first that the lens does not reach.
-    near_m
-        Farther than this from C no two rays of the image meet.
+    ``image_rad`` and ``limit_rad`` are the largest angle inside the image, and the first that the lens does
+    not reach. Farther than ``near_m`` from C no two rays of the image meet.
     """
 
     e: tuple[float, float, float]
@@ -91,33 +82,20 @@ class Entrance:
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, np.ndarray]:
         """Return theta of the ray through points, its sine and cosine, f'(theta), and where that is right.
 
-        Newton on the turn from the direction seen from C, whose sine and cosine need no trigonometry: with
-        g = s sin(theta) the condition reads f = rho sin(turn) - g = 0.
+        Newton on the turn from the direction seen from C: with g = s sin(theta) the condition reads
+        f = rho sin(turn) - g = 0.
         """
         per_rho = 1.0 / np.sqrt(lam * lam + w * w)
-        start = np.arctan2(lam, w)
-        sine_start, cosine_start = lam * per_rho, w * per_rho
-        theta, sine, cosine = start, sine_start, cosine_start
-        rise = self._lag_over_range(theta, sine, cosine, per_rho)
-        turn = rise[0] / (1.0 - rise[1])
+        start, sine, cosine = np.arctan2(lam, w), lam * per_rho, w * per_rho
+        lag, lag_rate = self._lag_over_range(start, sine, cosine, per_rho)
+        turn = lag / (1.0 - lag_rate)
         for _ in range(8):
-            theta = start + turn
-            if np.abs(turn).max() < _SMALL_TURN_RAD:
-                y = turn * turn
-                sine_turn = turn * (1.0 + y * (-1.0 / 6.0 + y * (1.0 / 120.0)))
-                cosine_turn = np.sqrt(1.0 - sine_turn * sine_turn)
-                sine = sine_start * cosine_turn + cosine_start * sine_turn
-                cosine = cosine_start * cosine_turn - sine_start * sine_turn
-            else:
-                sine_turn, cosine_turn, sine, cosine = (
-                    np.sin(turn),
-                    np.cos(turn),
-                    np.sin(theta),
-                    np.cos(theta),
-                )
-            rise = self._lag_over_range(theta, sine, cosine, per_rho)
-            slope = cosine_turn - rise[1]
-            step = (sine_turn - rise[0]) / slope
+            sine_turn, cosine_turn = np.sin(turn), np.cos(turn)
+            sine = (lam * cosine_turn + w * sine_turn) * per_rho
+            cosine = (w * cosine_turn - lam * sine_turn) * per_rho
+            lag, lag_rate = self._lag_over_range(start + turn, sine, cosine, per_rho)
+            slope = cosine_turn - lag_rate
+            step = (sine_turn - lag) / slope
             turn -= step
             if np.abs(step, out=step).max() < _SETTLED_RAD:
                 break
@@ -190,10 +168,8 @@ class RoundLens:
 
     Attributes
     ----------
-    r
-        r0, r1, r2, ...: 1 + r0 is above zero.
-    e
-        e0, e1, e2 of the entrance point; they count only if ``curved``.
+    r, e
+        r0, r1, r2, ...: 1 + r0 is above zero. e0, e1, e2 of the entrance point; used only if ``curved``.
     curved
         True for CAHVORE and the fisheye: the slope follows the angle by ``linearity``.
     linearity
@@ -333,17 +309,15 @@ class RoundLens:
         return Bent(slopes, valid, rates)
 
     def coefficient_rates(self, local_m: FloatArray) -> FloatArray:
-        """Return d slope / d (r1, r2, ..., and e0, e1, e2 if they count) (2, k, n) of points (3, n)."""
+        """Return d slope / d (r1, r2, ..., and e0, e1, e2 of a CAHVORE) (2, k, n) of points (3, n)."""
         a, b, w = local_m
         lam = np.maximum(np.sqrt(a * a + b * b), TINY)
         with_e = self.curved and len(self.r) == 3  # the fisheye has more coefficients and no e
         if with_e:
             theta, sine, _, rate, _ = self.entrance.angle(lam, w, True)
             chi = self._chi_of_angles(theta)
-        elif self.curved:
-            chi = np.arctan2(lam, w)
         else:
-            chi = lam / w
+            chi = self._slope(lam, w, False)[0]
         chi2 = chi * chi
         rates = [chi * chi2]
         for _ in self.r[2:]:
