@@ -1,8 +1,8 @@
 """The information of images of boards about a rig, before and after they are taken.
 
 Unknown are the cameras, the mast's axis offset and twist, the errors of both joints and one pose for each
-placement of a board. No board of unknown pose can show where the mast frame stands in the rover frame, nor
-pan zero and tilt zero. So the mast frame is held as the present estimate has it.
+placement of a board. No board of unknown pose can show where the mast frame is in the rover frame, nor
+pan zero and tilt zero. So the mast frame is fixed as the present estimate has it.
 
 Each shot (all cameras at one attitude of the head) adds JᵀJ of its weighted pixel rates, with the reading
 errors of its two joints eliminated. The prior is so wide that it only keeps directions closed that no picture
@@ -18,7 +18,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 
@@ -60,28 +59,12 @@ class BenchShot:
     tilt_approach: int = 0
 
 
-class Rates(NamedTuple):
-    """Pixels (n, 2) of points (n, 3), their rates to the rig's unknowns (n, 2, p), to the points (n, 2, 3)
-    and to the two joint readings (n, 2, 2)."""
-
-    pixels_px: FloatArray
-    to_rig: FloatArray
-    to_points: FloatArray
-    to_joints: FloatArray
-
-
 @dataclass(frozen=True, eq=False)
 class Knowledge:
     """A rig as it is estimated now, with the boards' poses, and what to make of shots of them.
 
-    Attributes
-    ----------
-    rig
-        Cameras, mast and joints of the present estimate.
-    boards
-        Placement to rover_from_board.
-    joint_sigma_rad
-        Of one reading of a joint, such as of its whole counts.
+    ``boards`` maps a placement to rover_from_board; ``joint_sigma_rad`` is that of one reading of a joint,
+    such as of its whole counts.
     """
 
     rig: Rig
@@ -119,34 +102,27 @@ class Knowledge:
 
     def of_shot(self, shot: BenchShot) -> FloatArray:
         """Return the information of one shot about the rig and its board's pose: (p + 6, p + 6)."""
-        rows, turned = [], []
-        board = self.boards[shot.placement]
+        size = len(self.names) + 8
+        rows = [np.empty((0, size))]
         for view in shot.views:
-            points = board.points(view.in_board_m)
-            seen = self.rates(view.camera, shot, points)
-            to_board = rigid_rates(seen.to_points, points, board.translation_m)
-            weight = 1.0 / view.sigma_px[:, None, None]
-            both = np.concatenate([seen.to_rig, to_board], axis=2) * weight
-            good = np.isfinite(both).all(axis=(1, 2))
-            rows.append(both[good].reshape(-1, both.shape[2]))
-            turned.append((seen.to_joints * weight)[good].reshape(-1, 2))
-        size = len(self.names) + 6
-        if not rows:
-            return np.zeros((size, size))
-        jacobian = np.concatenate(rows)
+            rates = self.view_rates(shot, view) / view.sigma_px[:, None, None]
+            rows.append(rates[np.isfinite(rates).all(axis=(1, 2))].reshape(-1, size))
+        whole = np.concatenate(rows)
+        jacobian, by_joint = whole[:, :-2], whole[:, -2:]
         information = jacobian.T @ jacobian
         if self.joint_sigma_rad > 0.0:
-            by_joint = np.concatenate(turned)
             across = by_joint.T @ jacobian
             own = by_joint.T @ by_joint + np.eye(2) / self.joint_sigma_rad**2
             information -= across.T @ np.linalg.solve(own, across)
         return np.asarray(information)
 
-    def rates(self, camera: str, shot: BenchShot, points_m: FloatArray) -> Rates:
-        """Return where a camera sees points (n, 3) of the rover frame, and how that depends on everything."""
-        names = (*self.names, *JOINT_NAMES)
-        seen = pixel_rates(self.rig, names, camera, *self._true_rad(shot), points_m, _approach(shot))
-        return Rates(seen.pixels_px, seen.to_rig[..., :-2], seen.to_points, seen.to_rig[..., -2:])
+    def view_rates(self, shot: BenchShot, view: BoardView) -> FloatArray:
+        """Return (n, 2, p + 8): how a view's corners depend on the rig, the board's pose and both readings."""
+        names, board = (*self.names, *JOINT_NAMES), self.boards[shot.placement]
+        points = board.points(view.in_board_m)
+        seen = pixel_rates(self.rig, names, view.camera, *self._true_rad(shot), points, _approach(shot))
+        to_board = rigid_rates(seen.to_points, points, board.translation_m)
+        return np.concatenate([seen.to_rig[..., :-2], to_board, seen.to_rig[..., -2:]], axis=2)
 
     def head(self, shot: BenchShot) -> Gimbal:
         """Return where the head truly is, as the estimate has it."""
@@ -180,18 +156,10 @@ STEPS = (5, 3)
 
 @dataclass(frozen=True)
 class Workspace:
-    """Where a rig points: joint angles at which targets are clicked, and how far away they are.
+    """Where a rig points: joint angles at which targets are clicked, from where to where, and their ranges.
 
-    Attributes
-    ----------
-    cameras
-        The clicked camera, and its partner if there is one.
-    pan_rad, tilt_rad
-        From where to where.
-    ranges_m
-        Of the targets.
-    one_sided
-        Whether the head approaches every goal from the same side by itself, so that backlash is no error.
+    ``cameras`` are the clicked one, and its partner if there is one. A ``one_sided`` head approaches every
+    goal from the same side by itself, so that backlash is no error.
     """
 
     cameras: tuple[str, ...]
@@ -230,10 +198,7 @@ class ExpectedPointing:
 def pointing(known: Knowledge, where: Workspace) -> ExpectedPointing:
     """Return how pointing over the workspace depends on what is unknown.
 
-    Raises
-    ------
-    CalibError
-        If nothing of the workspace can be pointed at.
+    Raises CalibError if nothing of the workspace can be pointed at.
     """
     rig, camera = known.rig, where.cameras[0]
     size_px = np.array(rig.cameras[camera].model.size_px)

@@ -1,4 +1,4 @@
-"""Where a board should stand next: places in words for a person, and the most informative of them.
+"""Where a board should be put next: places, described for a person, and the most informative of them.
 
 A camera on the body is tied to the head by boards that both see. It does not move: however many pictures are
 taken, each placement shows it the board once.
@@ -28,12 +28,12 @@ SMALLEST_PART = 0.2
 """Of the picture's width that a board should fill at least: farther away it shows little."""
 
 PATTERN = ((0.5, 0.5), (0.2, 0.25), (0.8, 0.75), (0.8, 0.25), (0.2, 0.75))
-"""Where in the picture the middle of a board that does not stand yet is supposed to be, shot by shot."""
+"""Where in the picture the middle of a board is assumed to be, shot by shot."""
 
 
 @dataclass(frozen=True)
 class Placement:
-    """A place for a board, as it is asked for.
+    """A place for a board, as it is requested.
 
     Attributes
     ----------
@@ -67,13 +67,13 @@ class Placement:
         return f"{where}, {self.range_m:.1f} m away, {how}"
 
     def rover_from_board(self, head_in_rover: Rigid) -> Rigid:
-        """Return the pose (board: x right, y down, z into it) with the head at zero standing so."""
+        """Return the pose (board: x right, y down, z into it) there, by the head's at zero angles."""
         bearing, height = math.radians(self.bearing_deg), math.radians(self.height_deg)
         sight = np.array(
             [math.cos(height) * math.cos(bearing), math.cos(height) * math.sin(bearing), -math.sin(height)]
         )
-        # The face of a board that is turned to the right looks to the right: its normal, away from the head,
-        # then points to the left of the line of sight.
+        # The normal of a board whose face is turned to the right points, away from the head, to the left of
+        # the line of sight.
         yaw = bearing - math.radians(self.turned_deg[0])
         pitch = height - math.radians(self.turned_deg[1])
         into = np.array([math.cos(pitch) * math.cos(yaw), math.cos(pitch) * math.sin(yaw), -math.sin(pitch)])
@@ -97,7 +97,7 @@ def _side(angle_deg: float, negative: str, positive: str, none: str) -> str:
 
 
 def first_placement(known: Knowledge, sought: Sought) -> Placement:
-    """Return where the first board should stand: ahead, near, with room about it, turned a bit."""
+    """Return where the first board should be put: ahead, near, with space about it, turned a bit."""
     bearing_deg, height_deg = _inside(0.0, sought.pan_limits_rad), _inside(0.0, sought.tilt_limits_rad)
     return Placement(_near_m(known, sought), bearing_deg, height_deg, (20.0, 0.0))
 
@@ -167,7 +167,7 @@ def advise(
 
 
 def information_of(known: Knowledge, sought: Sought, placement: Placement) -> FloatArray | None:
-    """Return the information of a pattern of shots of a board that stood so; None of too few."""
+    """Return the information of a pattern of shots of a board at a place; None of too few."""
     head = known.rig.mast.rover_from_head(0.0, 0.0)
     supposed = replace(known, boards={"": placement.rover_from_board(head)})
     camera = next(c for c in known.rig.cameras.values() if c.on == "head")
@@ -191,7 +191,7 @@ BODY_HEIGHTS_DEG = (-60.0, -50.0, -40.0, -30.0, -15.0)
 """Body cameras mostly look down, at what is near."""
 
 BELOW_M = 0.3
-"""How far below a body camera the middle of a board is supposed to find room over the ground."""
+"""How far below a body camera the middle of a board is assumed to fit over the ground."""
 
 RANGE_M = 2.0
 GRID = 5
@@ -247,7 +247,7 @@ def advise_for_body(
 
 
 def _sees(known: Knowledge, sought: Sought, placement: Placement) -> set[str]:
-    """Which body cameras see a board that stands so."""
+    """Which body cameras see a board at a place."""
     pose = placement.rover_from_board(known.rig.mast.rover_from_head(0.0, 0.0))
     fixed = {name: known.rig.cameras[name] for name in body_cameras(known)}
     on_body = Knowledge(replace(known.rig, cameras=fixed, stereo={}), {"": pose})

@@ -1,6 +1,6 @@
 """Attitudes of the head that show a board, and the most informative one among them.
 
-Where a board is, one picture of it and a rig that is known roughly say.
+One picture of a board and a rig that is known roughly show where the board is.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ PLACES = (-0.05, 0.12, 0.31, 0.5, 0.69, 0.88, 1.05)
 """Where in a camera's picture the board's middle is tried, in parts of its width and of its height."""
 
 EDGE_PX = 6.0
-"""Corners nearer to the picture's edge are not counted on."""
+"""Corners nearer to the picture's edge are not relied on."""
 
 FLATTEST = 0.35
-"""Cosine of the angle between a board's normal and the line of sight below which no corner is counted on."""
+"""Cosine of the angle between a board's normal and the line of sight below which no corner is relied on."""
 
 APART_RAD = 0.02
 """Attitudes nearer to one that did not show the board, or was taken already, are not tried again."""
@@ -47,18 +47,14 @@ ANYWHERE = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Sought:
-    """The requirements of a shot, and where the head may look.
+    """The requirements of a shot, and the head's limits.
 
     Attributes
     ----------
-    in_board_m
-        (n, 3) all corners of the board.
-    sigma_px
-        Of a corner.
+    in_board_m, sigma_px
+        (n, 3) all corners of the board, and the sigma of one.
     least
-        Corners that a picture must show to count; all of them for a board whose parts look alike.
-    pan_limits_rad, tilt_limits_rad
-        The head's.
+        Corners that a picture must show to be used; all of them for a board whose parts look alike.
     one_sided
         Whether the head itself approaches from one side: from which one then makes no difference.
     """
@@ -117,12 +113,7 @@ def readings(
 ) -> tuple[float, float]:
     """Return what the joints read, within the head's limits, when a head camera has a point at a pixel.
 
-    By default that is the image's centre.
-
-    Raises
-    ------
-    Unreachable, CalibError, ValueError
-        If no reading does.
+    By default that is the image's centre. Raises Unreachable, CalibError or ValueError if no reading does.
     """
 
     def read_rad(angles: Solution) -> tuple[float, float]:
@@ -157,16 +148,8 @@ def next_shot(
 
     Parameters
     ----------
-    known
-        The present estimate, with the board's pose.
-    sought
-        What a shot has to show.
-    shots
-        What was taken, of every placement.
-    placement
-        Where the board stands now.
-    aim
-        What the rig is for.
+    shots, placement
+        What was taken, of every placement; and where the board is now.
     avoid
         Attitudes (pan, tilt), radians, that are no use, as where the board was not found.
     ahead
@@ -298,24 +281,13 @@ FEWEST = 4
 def rover_from_board(
     rig: Rig, camera: str, pan_rad: float, tilt_rad: float, in_board_m: FloatArray, pixels_px: FloatArray
 ) -> Rigid:
-    """Return the pose of a flat board in the rover frame.
+    """Return the pose of a flat board in the rover frame, seen by a camera at true joint angles.
 
-    Parameters
-    ----------
-    rig, camera
-        The camera that sees it.
-    pan_rad, tilt_rad
-        True joint angles, radians.
-    in_board_m, pixels_px
-        (n, 3) and (n, 2), at least four corners that are not in one line.
-
-    Raises
-    ------
-    CalibError
-        If they do not fix a pose in front of the camera.
+    ``in_board_m`` and ``pixels_px`` are (n, 3) and (n, 2), at least four corners that are not in one line.
+    Raises CalibError if they do not fix a pose in front of the camera.
     """
-    held = rig.cameras[camera]
-    model = held.model
+    mounted = rig.cameras[camera]
+    model = mounted.model
     axes = model.axes
     rays = model.ray(pixels_px).directions @ axes
     if len(rays) < FEWEST:
@@ -330,5 +302,5 @@ def rover_from_board(
     if not done or not np.isfinite(place).all() or place[2, 0] <= 0.0:
         raise CalibError(f"the corners in the picture of {camera} fix no board")
     left, _, right = np.linalg.svd(axes @ cv2.Rodrigues(turn)[0])  # to the nearest rotation
-    here = Rigid(left @ right, axes @ place[:, 0] + model.C)
-    return here if held.on == "rover" else rig.mast.rover_from_head(pan_rad, tilt_rad) @ here
+    pose = Rigid(left @ right, axes @ place[:, 0] + model.C)
+    return pose if mounted.on == "rover" else rig.mast.rover_from_head(pan_rad, tilt_rad) @ pose

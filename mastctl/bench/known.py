@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from calib.adjust.solver import covariance_of
 from calib.errors import CalibError, Unreachable
-from calib.geometry.rigid import Rigid, rigid_rates
+from calib.geometry.rigid import Rigid
 from calib.plan.knowledge import BenchShot, BoardView, ExpectedPointing, Knowledge, Workspace, pointing
 from calib.plan.placements import FEWEST, body_cameras
 from calib.plan.poses import Sought, expected_px, readings, rover_from_board, shown, with_board
@@ -207,16 +207,12 @@ class BenchKnowledge:
         """Return what corners of looks that were not fitted should be off by, rms per axis, by camera."""
         told: dict[str, list[float]] = {}
         covariance = covariance_of(with_board(self.now, self.shots, name))
-        board = self.now.boards[name]
         for look in looks:
             shot = self._shot(name, look)
             for view in shot.views:
-                points = board.points(view.in_board_m)
-                rates = self.now.rates(view.camera, shot, points)
-                to_board = rigid_rates(rates.to_points, points, board.translation_m)
-                both = np.concatenate([rates.to_rig, to_board], axis=2)
-                by_rig = np.einsum("nip,pq,niq->ni", both, covariance, both)
-                by_joints = self.now.joint_sigma_rad**2 * (rates.to_joints**2).sum(axis=2)
+                rates = self.now.view_rates(shot, view)
+                by_rig = np.einsum("nip,pq,niq->ni", rates[..., :-2], covariance, rates[..., :-2])
+                by_joints = self.now.joint_sigma_rad**2 * (rates[..., -2:] ** 2).sum(axis=2)
                 told.setdefault(view.camera, []).append(
                     float(np.mean(by_rig + by_joints)) + self.sought.sigma_px**2
                 )
