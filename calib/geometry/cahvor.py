@@ -48,12 +48,6 @@ FREE: tuple[str, ...] = tuple(COEFFICIENTS)
 _UNIT = 1e-9
 """How far the length of A and O may be from 1."""
 
-_ROUNDING = 4e-16
-"""A length this close to 1 is 1: such vectors keep their bits when a file is read and written."""
-
-_FLAT = 1e-12
-"""Relative volume of H, V, A below which they lie in one plane."""
-
 
 class Rays(NamedTuple):
     """Rays through pixels, in the model's frame; rows that do not exist are not-a-number.
@@ -167,7 +161,8 @@ class CameraModel(ReadOnlyArrays):
             raise ValueError(f"R begins with {self.R[0]:g} where a number above -1 is expected")
         hva = np.array([self.H, self.V, self.A])
         lengths = np.sqrt(np.einsum("ij,ij->i", hva, hva))
-        if not lengths.all() or not abs(np.linalg.det(hva / lengths[:, None])) > _FLAT:
+        # Relative volume of H, V, A below which they lie in one plane.
+        if not lengths.all() or not abs(np.linalg.det(hva / lengths[:, None])) > 1e-12:
             raise ValueError("H, V and A lie in one plane where three directions are expected")
         axes = _axes_of(self.A, self.V) if self.kind in FREE else np.array([*tangents(self.O), self.O])
         self._set("_rows", np.array([self.C, *hva, *axes]))
@@ -251,7 +246,8 @@ class CameraModel(ReadOnlyArrays):
             length = float(np.linalg.norm(axis))
             if not 0.0 < length < inf:
                 raise ValueError(f"{letter} is {axis.tolist()} where a direction is expected")
-            is_unit = abs(length - 1.0) <= _ROUNDING
+            # A length so close to 1 is 1: such vectors keep their bits when a file is read and written.
+            is_unit = abs(length - 1.0) <= 4e-16
             units[letter] = axis if is_unit else axis / length
             stretched |= not is_unit
         vectors = {"C": C, "H": H, "V": V, "O": None, "R": R, "E": E} | units

@@ -21,7 +21,6 @@ from calib.geometry.rigid import FloatArray, ReadOnlyArrays, frozen_array
 NORMAL_95 = 1.96
 FARTHEST_M = 1e5
 """The assumed range of a target whose range cannot be measured."""
-_ROUNDS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +178,7 @@ def shown(
         weight = np.linalg.inv(expected.covariance_px2 + sigma_px**2 * np.eye(2))
         model = rig.camera_in_rover(camera, *joints_rad)
         prior, along = 1.0 / sigma**2, expected.along_px_m
-        for _ in range(_ROUNDS):
+        for _ in range(6):
             at = replace(sight, inverse_m=inverse)
             left = pixel_px - np.asarray(model.project(at.position_m(rig))[0])
             information = prior + float(along @ weight @ along)

@@ -21,15 +21,6 @@ from calib.geometry.rig import Mast
 from calib.geometry.rigid import FloatArray
 from calib.geometry.solutions import Solution, Solutions, check_here, order
 
-_SAME_RAD = 1e-7
-"""Solutions closer than this are one: at the edge of reach two meet, good to the root of rounding."""
-
-_PARALLEL = 1e-3
-"""``|cos k|`` below this: the axes are parallel to a milliradian, and the mast is not a pan/tilt head."""
-
-_FARTHEST_M = 1e9
-"""Coordinates from here on are refused as a mistake; their squares would overflow in the end."""
-
 _MOST = 4
 """Pairs of joint angles that a target can have: as many as the quartic has roots."""
 
@@ -185,12 +176,14 @@ def _solve(
         raise Unreachable(
             "bad_target", f"target of shape {target.shape} where three coordinates are expected"
         )
-    if not (np.abs(target) < _FARTHEST_M).all():
+    # Coordinates from here on are a mistake; their squares would overflow in the end.
+    if not (np.abs(target) < 1e9).all():
         raise Unreachable("bad_target", f"target {target.tolist()} is not three finite numbers below 1e9 m")
     x, y, z = ((target - mast.translation_m) @ mast.rover_from_mast.rotation).tolist()
     k = mast.axis_twist_rad
     arm = Arm(mast.axis_offset_m, math.sin(k), math.cos(k), _triple(origin_m), _triple(direction))
-    if abs(arm.cos_k) < _PARALLEL:
+    # The axes are parallel to a milliradian, and the mast is not a pan/tilt head.
+    if abs(arm.cos_k) < 1e-3:
         raise Unreachable(
             "parallel_axes", f"pan and tilt axes are parallel (cos k = {arm.cos_k:.2g}): not a pan/tilt head"
         )
@@ -224,4 +217,5 @@ def _wrapped(angle_rad: float) -> float:
 
 
 def _same(one_rad: float, other_rad: float) -> bool:
-    return abs(math.remainder(one_rad - other_rad, math.tau)) < _SAME_RAD
+    # Solutions so close are one: at the edge of reach two meet, good to the root of rounding.
+    return abs(math.remainder(one_rad - other_rad, math.tau)) < 1e-7

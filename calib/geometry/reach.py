@@ -31,12 +31,6 @@ from calib.errors import Unreachable
 EDGE = 1e-12
 """A miss up to this part of the target's distance is rounding: the target is then on the edge of reach."""
 
-_NO_OFFSET_M = 1e-13
-"""Axis offsets below this are nothing (2e-13 rad at half a metre) and would underflow in the quartic."""
-
-_FAR_OUT = 1e4
-"""The search for the edge of reach ends at this many times the target's distance: there is none."""
-
 
 @dataclass(frozen=True)
 class Arm:
@@ -63,7 +57,8 @@ class Arm:
     def points(self, rho: float, z: float) -> Iterator[tuple[float, float, float]]:
         """Yield (u_x, u_y, s) of every solution, s > 0; duplicates may come."""
         # sigma = s + c·d runs along the ray from its point nearest the head's origin: |w|² = miss2 + sigma².
-        a = self.a if abs(self.a) >= _NO_OFFSET_M else 0.0
+        # Offsets below this are nothing (2e-13 rad at half a metre) and would underflow in the quartic.
+        a = self.a if abs(self.a) >= 1e-13 else 0.0
         reach2 = rho * rho + z * z + a * a - self.miss2
         slack = EDGE * math.hypot(rho, z)
         # u_y = y_0 + y_1 sigma, from w_y = u_y cos k + z sin k
@@ -152,7 +147,8 @@ class Arm:
         inside, outside = rho, max(2.0 * rho, 1e-3 * math.hypot(rho, z))
         while not reached(outside):
             inside, outside = outside, 2.0 * outside
-            if outside > _FAR_OUT * math.hypot(rho, z):
+            # So far from the target's distance there is no edge of reach.
+            if outside > 1e4 * math.hypot(rho, z):
                 return None
         while outside - inside > 1e-12 * outside:
             middle = 0.5 * (inside + outside)

@@ -41,7 +41,6 @@ MOST_HARMONICS = 2
 STEEPEST = 0.25
 """Σ i |(c_i, s_i)| of an axis at most: Newton's steps from the identity then come home from any angle."""
 LARGEST_BACKLASH_RAD = 0.2
-_ROUNDING_RAD = 1e-15
 _STEPS = 60  # four do for tens of milliradians
 
 AXIS_NAMES = ("c1", "s1", "c2", "s2", "backlash_rad")
@@ -122,7 +121,7 @@ class AxisJoint:
         for _ in range(_STEPS):
             step = (self._true(at) - true_rad) / self._slope(at)
             at = at - step
-            if np.max(np.abs(step), initial=0.0) <= _ROUNDING_RAD * (1.0 + np.max(np.abs(at), initial=0.0)):
+            if np.max(np.abs(step), initial=0.0) <= 1e-15 * (1.0 + np.max(np.abs(at), initial=0.0)):
                 break
         found: _Angle = at + slack
         return found

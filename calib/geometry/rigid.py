@@ -110,10 +110,6 @@ def tangents(axis: FloatArray) -> FloatArray:
     return np.array([first, crossed(axis, first)])
 
 
-NO_ROTATION = 1e-6
-"""How far R Rᵀ may be from the identity: a label's six digits make a part of it."""
-
-
 @dataclass(frozen=True, eq=False)
 class Rigid(ReadOnlyArrays):
     """A rigid transform ``b_from_a``: x_in_b = rotation @ x_in_a + translation_m.
@@ -128,7 +124,8 @@ class Rigid(ReadOnlyArrays):
     def __post_init__(self) -> None:
         object.__setattr__(self, "rotation", frozen_array(self.rotation, (3, 3)))
         off = float(np.abs(self.rotation @ self.rotation.T - np.eye(3)).max())
-        if not off <= NO_ROTATION or np.linalg.det(self.rotation) < 0.0:
+        # 1e-6: how far R Rᵀ may be from the identity: a label's six digits make a part of it.
+        if not off <= 1e-6 or np.linalg.det(self.rotation) < 0.0:
             raise ValueError(
                 f"{self.rotation.tolist()} is no rotation: it stretches or shears by {off:.2g}, or mirrors"
             )

@@ -29,17 +29,10 @@ from numpy.typing import NDArray
 from calib.geometry.rigid import FloatArray
 from calib.matching.warp import Grey, Surface, patch_grid
 
-MOST_STEPS = 12
 STEP_ENOUGH_PX = 1e-4
-WORST_DEFORMATION = 0.5  # beyond it the patch is not the same thing any more
-SMOOTH_PX = 0.8  # of the template before its derivative
-WORST_CONDITION = 1e15
 NARROW = 0.35  # of the Gaussian's sigma: slope and scale come from all of it, the place from its middle
 LEAST_COUNT = 0.01  # of a Gaussian weight that is worth computing
 _RIGID = [0, 1, 6, 7]  # the columns of place, gain and offset
-BLOT_PX = 4.0  # one sigma of the Gaussian by which neighbours say together that a place shows something else
-BLOT_SIGMAS = 2.5  # of what is usual, at which a place counts a quarter
-FLOOR_PX = 0.002  # what cubic interpolation itself leaves, measured without noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +94,8 @@ def match_least_squares(
     inner = (slice(2, -2), slice(2, -2))  # the border has no two-sided gradient
     q, t = offsets[inner], values[inner]
     jacobian = _columns(_gradient(values)[inner], q, t)
-    weights = _columns(_gradient(ndimage.gaussian_filter(values, SMOOTH_PX))[inner], q, t)
+    # The template is smoothed before its derivative.
+    weights = _columns(_gradient(ndimage.gaussian_filter(values, 0.8))[inner], q, t)
     start = np.asarray(start_px, dtype=np.float64)
     surface = Surface.around(image, start + q.min(axis=(0, 1)), start + q.max(axis=(0, 1)), margin_px=3)
 
@@ -148,13 +142,15 @@ def _alike(fit: _PatchFit, surface: Surface, q: FloatArray, t: FloatArray, count
 
     seen = surface.at(fit.position + q + q @ fit.deformation.T)
     gain, offset = _Photometry(t, counts).of(seen)
+    # One sigma of the Gaussian by which neighbours say together that a place shows something else.
     total, rest = (
-        ndimage.gaussian_filter(values, BLOT_PX, mode="constant")
+        ndimage.gaussian_filter(values, 4.0, mode="constant")
         for values in (counts, counts * (seen - gain * t - offset))
     )
     mean = rest / np.maximum(total, LEAST_COUNT)
     usual = 1.4826 * float(np.median(np.abs(mean[counts > LEAST_COUNT])))
-    return np.asarray(1.0 / (1.0 + (mean / max(BLOT_SIGMAS * usual, 1e-6)) ** 2) ** 2)
+    # At 2.5 times what is usual a place is weighted by a quarter.
+    return np.asarray(1.0 / (1.0 + (mean / max(2.5 * usual, 1e-6)) ** 2) ** 2)
 
 
 def gaussian(q: FloatArray, covariance_px2: FloatArray) -> FloatArray:
@@ -204,7 +200,8 @@ def _refined(fit: _PatchFit, block_px: float) -> LeastSquaresMatch | None:
     except np.linalg.LinAlgError:
         return None
     place = moved[:, :2] / fit.gain
-    covariance = (1.0 - 1.0 / len(place)) * place.T @ place + FLOOR_PX**2 * np.eye(2)
+    # 0.002: what cubic interpolation itself leaves, measured without noise.
+    covariance = (1.0 - 1.0 / len(place)) * place.T @ place + 0.002**2 * np.eye(2)
     correlation = fit.correlation
     if not np.isfinite(covariance).all() or not np.isfinite(correlation):
         return None
@@ -229,11 +226,11 @@ def _settled(
     except np.linalg.LinAlgError:
         return None
     # Largest entries for norms: within a factor of the matrix' size of the condition.
-    if not float(np.abs(normal).max() * np.abs(inverse).max()) < WORST_CONDITION:
+    if not float(np.abs(normal).max() * np.abs(inverse).max()) < 1e15:
         return None
     position, deformation = fit.position, fit.deformation
     photometry = _Photometry(t, counts)
-    for _ in range(MOST_STEPS):
+    for _ in range(12):
         places = position + q + q @ deformation.T
         if not surface.inside(places[[0, 0, -1, -1], [0, -1, 0, -1]]):  # the corners
             return None
@@ -251,7 +248,8 @@ def _settled(
         position = position + move
         if len(step) > 4:
             deformation = deformation + (step[2:6] / gain).reshape(2, 2)
-        if np.linalg.norm(deformation) > WORST_DEFORMATION:
+        # 0.5: beyond it the patch is not the same thing any more.
+        if np.linalg.norm(deformation) > 0.5:
             return None
         if length < enough_px:
             return _PatchFit(position, deformation, gain, t, rest, counts, weighted, jacobian)

@@ -48,11 +48,7 @@ from calib.matching.warp import Plane, PosedImage
 
 STEPS = 20
 """Gauss-Newton steps at most: near a camera the first ones are long..."""
-ENOUGH = 1e-4
-"""...and the step, in sigmas of the point, after which no more are made."""
 
-ONE_CAMERA_CHI2 = 13.8
-"""As `TrackSettings.worst_chi2`, of the two pixel coordinates of one camera."""
 
 UNKNOWN_M = 100.0
 """One sigma of where a target is of which only the pictures show."""
@@ -98,7 +94,8 @@ def one_point(
             chi2 += float(rest @ weight @ rest)
         step = np.linalg.solve(normal, right)
         position = position + step
-        if step @ right < ENOUGH**2:
+        # 1e-4: and the step, in sigmas of the point, after which no more are made.
+        if step @ right < 1e-4**2:
             return OnePoint(position, np.linalg.inv(normal), chi2)
     return None
 
@@ -235,7 +232,8 @@ def _seen(track: Track, images: Images, settings: TrackSettings) -> TrackLook:
     if len(good) > 1 and track.motion_covariance.any():
         seen = one_point(point.position_m, UNKNOWN_M**2 * np.eye(3), sightings, settings.model_px)
         doubt = None if seen is None else pose_doubt(track.position_m, track.covariance_m2, seen)
-    allowed = settings.worst_chi2 if len(good) > 1 else ONE_CAMERA_CHI2
+    # 13.8: as `TrackSettings.worst_chi2`, of the two pixel coordinates of one camera.
+    allowed = settings.worst_chi2 if len(good) > 1 else 13.8
     if point.chi2 > allowed:
         reason = (
             f"the match does not fit the prediction: weighted misfit {point.chi2:.0f}, at most "

@@ -24,12 +24,6 @@ from calib.matching.sweep import Swept, sweep
 from calib.matching.verdict import MatchSettings, PatchMatch, no_match, rivalled, worst_px2
 from calib.matching.warp import GRAZING, SIDES, Plane, PosedImage, Relief, carry
 
-LAST_SEARCH_PX = 4.0
-
-AROUND_PX = 3  # the surface is seen as far beyond the patch: another view turns and slants it
-
-MATCHED_BACK_PX = 2.0  # the search back is not refined: half a pixel of the sweep, and slope
-
 
 @dataclass(frozen=True, eq=False)
 class StereoMatch:
@@ -83,7 +77,7 @@ def find_partner(
         assert refused is not None
         return StereoMatch(refused)
     plane, relief, second = surface
-    found = match_patch(own, pixel, plane, partner, LAST_SEARCH_PX, settings, relief)
+    found = match_patch(own, pixel, plane, partner, 4.0, settings, relief)
     if found.verdict != "good":
         return StereoMatch(found)
     try:
@@ -91,7 +85,8 @@ def find_partner(
     except NoStereoPoint as error:
         return StereoMatch(no_match("weak", f"the two cameras see no common point: {error}", found.pixel_px))
     across, sigma = _across(own.camera, pixel, partner.camera, plane, found)
-    allowed = MATCHED_BACK_PX + abs(across) + math.sqrt(worst_px2(found.covariance_px2))
+    # 2.0: the search back is not refined: half a pixel of the sweep, and slope.
+    allowed = 2.0 + abs(across) + math.sqrt(worst_px2(found.covariance_px2))
     apart = math.inf
     for size in sizes:
         back = sweep(partner, found.pixel_px, own, nearest_m, size)
@@ -121,7 +116,8 @@ def _surface(
             f"beside {swept.score:.2f}"
         )
         return no_match("ambiguous", reason, *facts)
-    half = settings.half_px + AROUND_PX
+    # 3: the surface is seen as far beyond the patch: another view turns and slants it.
+    half = settings.half_px + 3
     seen = surface_seen(own, pixel, partner, swept.plane, half, settings.noise_dn)
     if seen is None:
         reason = "the two cameras see no common surface there: an edge, or hidden from one of them"

@@ -35,12 +35,6 @@ from calib.matching.warp import (
     warp_patch,
 )
 
-MOST_ASPECT = 5.0  # of a weight that is round on a surface seen flat
-
-FLAT_DN2 = 0.1  # grey variance below which there is no noise either, and sums of single precision show none
-
-COUNTS_TO = 2.2  # sigmas of that weight, beyond which pixels are left out
-
 
 def match_patch(
     source: PosedImage,
@@ -173,13 +167,15 @@ def near_covariance(plane: Plane, camera: CameraModel, pixel: FloatArray, near_p
     _, rate, _ = camera.project_jacobian(ray.origins_m + range_m * ray.directions)
     seen = rate @ plane.axes
     values, vectors = np.linalg.eigh(seen @ seen.T)
-    aspect = min(float(np.sqrt(values[1] / max(values[0], 1e-12 * values[1]))), MOST_ASPECT)
+    # 5.0: of a weight that is round on a surface seen flat.
+    aspect = min(float(np.sqrt(values[1] / max(values[0], 1e-12 * values[1]))), 5.0)
     return np.asarray((vectors * np.array([near_px**2 / aspect, near_px**2 * aspect])) @ vectors.T)
 
 
 def near_half_px(near_px2: FloatArray) -> NDArray[np.intp]:
     """Return the half sides (x, y) of the patch that such a Gaussian weighs."""
-    return np.asarray(np.ceil(COUNTS_TO * np.sqrt(np.diag(near_px2))).astype(np.intp) + 2)
+    # 2.2: sigmas of that weight, beyond which pixels are left out.
+    return np.asarray(np.ceil(2.2 * np.sqrt(np.diag(near_px2))).astype(np.intp) + 2)
 
 
 def _search(
@@ -255,7 +251,8 @@ def correlations(image: Grey, patch: Grey, counts: FloatArray | None) -> NDArray
 
     spread = summed(shifted * shifted, weights) - summed(shifted, weights) ** 2 / total
     length = np.sqrt(np.maximum(spread * float((weighted * patch).sum()), 1e-3))
-    scores = np.where(spread > FLAT_DN2 * total, summed(shifted, weighted) / length, 0.0)
+    # 0.1: grey variance below which there is no noise either, and sums of single precision show none.
+    scores = np.where(spread > 0.1 * total, summed(shifted, weighted) / length, 0.0)
     return scores.astype(np.float32)
 
 

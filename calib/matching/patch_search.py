@@ -19,16 +19,12 @@ from numpy.typing import NDArray
 from calib.geometry.rigid import FloatArray
 from calib.matching.warp import Grey, Mask, square_grid, summit
 
-COLUMNS = 256
-"""About as wide are the reduced pictures."""
 HALF = 7
 """Half of a patch's side, reduced pixels: 15 of them are 60 of a picture of 1024 columns."""
 CELL = 22
 """One patch, the best textured, of each square of this side, reduced pixels."""
 NOISE_DN = 1.0
 """Grey noise of a reduced picture: a sixteenth of a pixel's variance, and rounding."""
-FLAT_SIGMA = 0.3
-"""A patch whose texture cannot hold this in its worst direction, reduced pixels, is too plain."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +37,8 @@ class Reduced:
     @classmethod
     def of(cls, image: Grey) -> Reduced:
         """Reduce a picture (h, w) to about `COLUMNS` columns; what fills no whole pixel is left out."""
-        step = max(1, round(image.shape[1] / COLUMNS))
+        # 256: about as wide are the reduced pictures.
+        step = max(1, round(image.shape[1] / 256))
         height, width = (n // step for n in image.shape)
         cut = image[: height * step, : width * step]
         return cls(np.asarray(cv2.resize(cut, (width, height), interpolation=cv2.INTER_AREA)), step)
@@ -75,7 +72,8 @@ def textured(picture: Reduced) -> FloatArray:
     eigen = cv2.cornerMinEigenVal(picture.grey, side, ksize=3)
     # OpenCV scales its Sobel by 1 / (4 side), which is a difference per pixel times 8 / (4 side).
     summed = eigen * (side**2 / 4.0) - 0.1875 * NOISE_DN**2 * side**2
-    strength = summed[HALF:-HALF, HALF:-HALF] / (2.0 * NOISE_DN**2 / FLAT_SIGMA**2)
+    # 0.3: a patch whose texture cannot hold this in its worst direction, reduced pixels, is too plain.
+    strength = summed[HALF:-HALF, HALF:-HALF] / (2.0 * NOISE_DN**2 / 0.3**2)
     rows, columns = (n // CELL for n in strength.shape)
     if min(rows, columns) == 0:
         return np.empty((0, 2))
@@ -130,8 +128,6 @@ def found(
     return low + HALF + place, float(best)
 
 
-AGREE = 1.2
-"""Patches agree whose places differ by no more, reduced pixels: relief, shape, and the search itself."""
 SEARCH_SIGMA = 0.15
 """Of one patch's place, reduced pixels; a smaller scatter of few patches is luck."""
 
@@ -184,7 +180,8 @@ def agreed_view(
     length2 = np.maximum((open_px**2).sum(axis=1), 1e-12)
     along = np.clip(np.einsum("mni,ni->mn", rest, open_px) / length2, -1.0, 1.0)
     apart = np.linalg.norm(rest - along[..., None] * open_px, axis=2)
-    agree = apart <= AGREE * step
+    # 1.2: patches agree whose places differ by no more, reduced pixels: relief, shape, and the search itself.
+    agree = apart <= 1.2 * step
     best = int(np.argmax(agree.sum(axis=1) - 1e-3 * np.where(agree, apart / step, 0.0).sum(axis=1)))
     which = agree[best]
     # What has a range says more than what has none.

@@ -39,28 +39,13 @@ STEP_PX = 0.5
 """...in such steps, between which a parabola shows the summit."""
 ACROSS_PX = 3.0
 """So far beside the epipolar line the other camera may see the patch: its calibration may be off."""
-FITS = 0.6
-"""Of what noise allows, a window must correlate by as much."""
-SPECKS_PX = 5
-"""Side of the median that leaves out what few pixels say by chance."""
-EDGE_PX = 3
-"""Pixels nearer to one that does not count do not count either: a window reaches over the edge."""
-SMOOTH_PX = 1.5
-"""One sigma of the Gaussian that averages neighbouring windows, which count by texture..."""
-MOST_VARIANCE_DN2 = 400.0
-"""...up to this: an edge's contrast says no more about the surface beside it."""
 PASSES = 2
 """So often the plane is fitted to what was seen off it."""
-LEAST_PIXELS = 30
-"""Fewer show no surface."""
-ROBUST_PX = 0.3
-"""Pixels farther off the fitted plane count less."""
 SIGMA_PX = 0.05
 """One sigma of a place along the epipolar line as single windows show it on smooth ground..."""
 NEAR_PX = 3
 """...to which what the windows within so many pixels differ by is added: rough, curved, or a step. Where they
 differ by no more than that the target lies on the plane, which all of the patch shows better."""
-FIT_STEPS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +75,8 @@ def surface_seen(
     """
     for fits in range(PASSES + 1):
         seen = _off_plane(own, pixel_px, partner, plane, half_px, noise_dn)
-        if seen is None or seen.counts.sum() < LEAST_PIXELS:
+        # Fewer pixels show no surface.
+        if seen is None or seen.counts.sum() < 30:
             return None
         if fits < PASSES:
             plane = _fitted(own.camera, pixel_px, plane, seen)
@@ -152,12 +138,17 @@ def _off_plane(
     off_px = (best + summit(before, best_score, after)) * np.float32(STEP_PX) - np.float32(REACH_PX)
     off_px = np.maximum(off_px, np.float32(px_m * (1.0 / FARTHEST_M - 1.0 / ranges[4])))  # nor beyond it
     within = (best_score >= before) & (best_score >= after)
-    fits = within & (best_score >= FITS * variance / (variance + noise_dn**2))
-    kept = cv2.medianBlur(fits.astype(np.uint8), SPECKS_PX)
-    weights = (fits & (kept > 0)) * np.maximum(best_score, 0.0) * np.minimum(variance, MOST_VARIANCE_DN2)
-    total, smooth = (cv2.GaussianBlur(v, (0, 0), SMOOTH_PX) for v in (weights, weights * off_px))
+    # A window must correlate by so much of what noise allows.
+    fits = within & (best_score >= 0.6 * variance / (variance + noise_dn**2))
+    # The median leaves out what few pixels say by chance.
+    kept = cv2.medianBlur(fits.astype(np.uint8), 5)
+    # Windows are weighted by texture up to 400: an edge's contrast says no more about the surface beside it.
+    weights = (fits & (kept > 0)) * np.maximum(best_score, 0.0) * np.minimum(variance, 400.0)
+    # One sigma of the Gaussian that averages neighbouring windows.
+    total, smooth = (cv2.GaussianBlur(v, (0, 0), 1.5) for v in (weights, weights * off_px))
     smooth = np.where(total > 1e-3, smooth / np.maximum(total, 1e-6), 0.0)
-    edge = np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)
+    # Pixels within 3 of one that is left out are left out too: a window reaches over the edge.
+    edge = np.ones((7, 7), np.uint8)
     counts = cv2.erode(kept, edge, borderType=cv2.BORDER_CONSTANT, borderValue=1)
     near = slice(half_px - NEAR_PX, half_px + NEAR_PX + 1)
     differ_px = float(cv2.medianBlur(off_px.astype(np.float32), 3)[near, near].std())
@@ -185,11 +176,12 @@ def _fitted(camera: CameraModel, pixel_px: FloatArray, plane: Plane, seen: _Seen
     off_px = seen.off_px.reshape(-1).astype(np.float64)
     near = np.exp(-0.5 * (places**2).sum(axis=1) / (half / 2) ** 2) * seen.counts.reshape(-1)
     robust = np.ones(len(places))
-    for _ in range(FIT_STEPS):
+    for _ in range(4):
         weighted = (near * robust)[:, None] * rows
         normal = rows.T @ weighted + np.diag([1e-9, 1e-3, 1e-3])
         terms = np.linalg.solve(normal, weighted.T @ off_px)
-        robust = 1.0 / (1.0 + ((off_px - rows @ terms) / ROBUST_PX) ** 2)
+        # Pixels farther off the fitted plane than 0.3 px are weighted less.
+        robust = 1.0 / (1.0 + ((off_px - rows @ terms) / 0.3) ** 2)
     corners = np.array([[0.0, 0.0], [half / 2, 0.0], [0.0, half / 2]])
     rays = camera.ray(pixel_px + corners)
     inverse = np.maximum(

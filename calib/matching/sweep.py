@@ -26,11 +26,8 @@ FARTHEST_M = 1e4  # as good as infinity for any stereo base on a rover
 
 COARSE = 2  # the first sweep uses every second pixel of half-size pictures
 
-DENSE = 400  # points of the ray by which the curve's length is known
 
 FINE_STEPS = np.arange(-3.0, 3.5, 0.5)  # px around each of the best coarse places
-
-BEST_KEPT = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +101,8 @@ def _curve(
     ray: Rays, partner: CameraModel, nearest_m: float, margin_px: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return inverse ranges (m,) and pixels (m, 2) along the epipolar line, about two pixels apart."""
-    dense = np.linspace(1.0 / FARTHEST_M, 1.0 / nearest_m, DENSE)
+    # 400: points of the ray by which the curve's length is known.
+    dense = np.linspace(1.0 / FARTHEST_M, 1.0 / nearest_m, 400)
     seen, valid = partner.project(ray.origins_m + ray.directions / dense[:, None])
     size = np.array(partner.size_px)
     with np.errstate(invalid="ignore"):
@@ -190,7 +188,7 @@ def _best_apart(scores: NDArray[np.float32], places: FloatArray, apart_px: float
     for index in tops[np.argsort(-scores[tops])]:
         if all(np.linalg.norm(places[index] - places[other]) > apart_px for other in kept):
             kept.append(int(index))
-        if len(kept) == BEST_KEPT:
+        if len(kept) == 4:
             break
     return kept
 

@@ -171,8 +171,6 @@ AROUND_PX = 80
 MOST_ALIKE = 0.9
 """Correlation with another place: the simulated rover's rocks and ground were seen to stay below 0.86,
 edges of its shadows to have 0.97."""
-WORST_SIGMA_PX = 0.2
-"""In the worst direction, of what grey noise alone would leave."""
 
 
 def indistinct(
@@ -190,7 +188,8 @@ def indistinct(
         return "the patch around it is cut by the picture's border"
     patch = image[low[1] : high[1], low[0] : high[0]]
     counts = gaussian(patch_grid((int(half[0]), int(half[1]))) + (middle - pixel_px), near_px2)
-    lacking = texture_lacks(patch, replace(settings, flat_sigma_px=WORST_SIGMA_PX), counts)
+    # 0.2: in the worst direction, of what grey noise alone would leave.
+    lacking = texture_lacks(patch, replace(settings, flat_sigma_px=0.2), counts)
     if lacking:
         return lacking
     first = np.maximum(low - AROUND_PX, 0)
@@ -208,9 +207,6 @@ def indistinct(
         )
     return ""
 
-
-MIDDLE_SEARCH_PX = 4.0
-"""How far the range of a patch's middle may put it from where the whole patch puts it, at the start."""
 
 CAMERAS_PX = 0.4
 """One sigma, each pixel coordinate, of what two cameras' models may be wrong by where a track is begun: what
@@ -240,7 +236,8 @@ def start_track(left: PosedImage, right: PosedImage, left_px: FloatArray, sigma_
     if found.match.verdict != "good" or found.plane is None:
         raise CalibError(f"the target cannot be followed: {found.match.reason}")
     # The patch that shows the surface reaches beyond it on a rock: the range is that of its middle.
-    middle = match_patch(left, pixel, found.plane, right, MIDDLE_SEARCH_PX, SIZES)
+    # 4.0: how far the range of a patch's middle may put it from where the whole patch puts it, at the start.
+    middle = match_patch(left, pixel, found.plane, right, 4.0, SIZES)
     reason = middle.reason or indistinct(left.image, left.camera, pixel, found.plane, SIZES)
     if reason:
         raise CalibError(f"the target cannot be followed: {reason}")

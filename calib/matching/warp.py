@@ -25,9 +25,6 @@ Mask = NDArray[np.bool_]
 SIDES = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])  # left, right, top, bottom
 GRAZING = 0.03  # sine of the flattest view of a plane that is still believed (1.7 degrees)
 KNOTS = np.array([-1.0, -1 / 3, 1 / 3, 1.0])  # across a patch, in units of its half side
-MOST_SAMPLES = 8  # per axis and destination pixel; shrinking further than 8 times is not needed
-LIFT_STEPS = 3  # a relief changes slowly against the pixels it shifts
-SPLINE_MARGIN_PX = 12  # a cubic spline's memory of its border is below 1e-6 after 11 samples
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +250,8 @@ def warp_patch(
         return None
     across, down = (np.linalg.norm(np.diff(knots, axis=a), axis=-1).max() for a in (1, 0))
     steps = np.array([across, down]) / (reach * (KNOTS[1] - KNOTS[0]))  # source pixels a destination pixel
-    many, tall = (int(n) for n in np.clip(np.ceil(steps - 0.25), 1, MOST_SAMPLES))
+    # 8: per axis and destination pixel; shrinking further than 8 times is not needed.
+    many, tall = (int(n) for n in np.clip(np.ceil(steps - 0.25), 1, 8))
     columns, rows = _cubic(half[0], many), _cubic(half[1], tall)
     maps = np.stack([rows @ knots[..., axis] @ columns.T for axis in (0, 1)], axis=-1)
     span = np.stack([(knots[:, -1] - knots[:, 0]).mean(axis=0), (knots[-1] - knots[0]).mean(axis=0)], axis=-1)
@@ -274,7 +272,8 @@ def _lifted(maps: FloatArray, relief: Relief, shift_px_m: FloatArray) -> tuple[F
     Source pixels that stand off the plane by 1/m are seen ``shift_px_m`` (2,) source pixels elsewhere.
     """
     places = maps
-    for _ in range(LIFT_STEPS):
+    # 3: a relief changes slowly against the pixels it shifts.
+    for _ in range(3):
         places = maps - relief.at(places)[0][..., None] * shift_px_m
     return places, relief.at(places)[1]
 
@@ -310,7 +309,8 @@ class Surface:
         """Return the spline of the image between two corners (x, y), with a margin as far as there is one."""
         from scipy import ndimage  # slow to load, and a daemon that starts does not need it
 
-        reach = SPLINE_MARGIN_PX + margin_px
+        # 12: a cubic spline's memory of its border is below 1e-6 after 11 samples.
+        reach = 12 + margin_px
         x0, y0 = np.maximum(np.floor(np.asarray(low_px)).astype(int) - reach, 0)
         x1, y1 = np.ceil(np.asarray(high_px)).astype(int) + reach + 1
         cut = image[y0:y1, x0:x1].astype(np.float64)

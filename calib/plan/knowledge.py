@@ -117,7 +117,7 @@ class Knowledge:
         return np.asarray(information)
 
     def view_rates(self, shot: BenchShot, view: BoardView) -> FloatArray:
-        """Return (n, 2, p + 8): how a view's corners depend on the rig, the board's pose and both readings."""
+        """Return (n, 2, p + 8): how a view's corners depend on rig, board's pose and both readings."""
         names, board = (*self.names, *JOINT_NAMES), self.boards[shot.placement]
         points = board.points(view.in_board_m)
         seen = pixel_rates(self.rig, names, view.camera, *self._true_rad(shot), points, _approach(shot))

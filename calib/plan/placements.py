@@ -24,8 +24,6 @@ RANGES_M = (0.8, 1.2, 1.8, 2.6)
 BEARINGS_DEG = (-50.0, -25.0, 0.0, 25.0, 50.0)
 HEIGHTS_DEG = (-25.0, -8.0, 8.0)
 TURNS_DEG = ((0.0, 0.0), (30.0, 0.0), (-30.0, 0.0), (0.0, 30.0), (0.0, -30.0))
-SMALLEST_PART = 0.2
-"""Of the picture's width that a board should fill at least: farther away it shows little."""
 
 PATTERN = ((0.5, 0.5), (0.2, 0.25), (0.8, 0.75), (0.8, 0.25), (0.2, 0.75))
 """Where in the picture the middle of a board is assumed to be, shot by shot."""
@@ -122,8 +120,9 @@ def placements(known: Knowledge, sought: Sought) -> Iterator[Placement]:
     """Yield places that the head's cameras can see, at ranges where the board is informative."""
     near_m = _near_m(known, sought)
     width_m = float(np.ptp(sought.in_board_m[:, 0]))
+    # 0.2: of the picture's width that a board should fill at least: farther away it shows little.
     far_m = min(
-        width_m * float(np.linalg.norm(c.model.H)) / (SMALLEST_PART * c.model.size_px[0])
+        width_m * float(np.linalg.norm(c.model.H)) / (0.2 * c.model.size_px[0])
         for c in known.rig.cameras.values() if c.on == "head"
     )  # fmt: skip
     ranges = [r for r in RANGES_M if near_m * 0.95 <= r <= max(far_m, near_m)] or [near_m]
@@ -190,10 +189,7 @@ def information_of(known: Knowledge, sought: Sought, placement: Placement) -> Fl
 BODY_HEIGHTS_DEG = (-60.0, -50.0, -40.0, -30.0, -15.0)
 """Body cameras mostly look down, at what is near."""
 
-BELOW_M = 0.3
-"""How far below a body camera the middle of a board is assumed to fit over the ground."""
 
-RANGE_M = 2.0
 GRID = 5
 """Where a body camera's pixels are judged: so far away, in so many rows and columns."""
 
@@ -215,7 +211,7 @@ def body_px(known: Knowledge, covariance: FloatArray, camera: str) -> float:
     width, height = model.size_px
     x, y = np.meshgrid(*((np.arange(GRID) + 0.5) / GRID * size for size in (width, height)))
     rays = model.ray(np.stack([x.ravel(), y.ravel()], axis=-1))
-    points = rays.origins_m[rays.valid] + RANGE_M * rays.directions[rays.valid]
+    points = rays.origins_m[rays.valid] + 2.0 * rays.directions[rays.valid]
     seen = predict(model, points)
     rates = seen.d_step[seen.valid]
     mine = [k for k, name in enumerate(known.names) if name.startswith(f"cameras.{camera}.")]
@@ -231,7 +227,8 @@ def advise_for_body(
     base = known.information(shots)
     best: tuple[int, float, Placement] | None = None
     head = known.rig.mast.rover_from_head(0.0, 0.0)
-    lowest_m = max(known.rig.cameras[name].model.C[2] for name in body_cameras(known)) + BELOW_M
+    # 0.3: how far below a body camera the middle of a board is assumed to fit over the ground.
+    lowest_m = max(known.rig.cameras[name].model.C[2] for name in body_cameras(known)) + 0.3
     for placement in _places(sought, RANGES_M, BODY_HEIGHTS_DEG):
         if placement.rover_from_board(head).translation_m[2] > lowest_m:
             continue

@@ -28,22 +28,6 @@ PLACES = (-0.05, 0.12, 0.31, 0.5, 0.69, 0.88, 1.05)
 EDGE_PX = 6.0
 """Corners nearer to the picture's edge are not relied on."""
 
-FLATTEST = 0.35
-"""Cosine of the angle between a board's normal and the line of sight below which no corner is relied on."""
-
-APART_RAD = 0.02
-"""Attitudes nearer to one that did not show the board, or was taken already, are not tried again."""
-
-
-SIDES_TRIED = 8
-"""Of how many of the best attitudes every way to approach them is tried."""
-
-EXCHANGES = 2
-"""Rounds in which each of some shots that are chosen together may give way to a better one."""
-
-ANYWHERE = 1e-6
-"""The prior of a board's pose before any picture: it is within some kilometre (1/m², 1/rad²)."""
-
 
 @dataclass(frozen=True, eq=False)
 class Sought:
@@ -97,7 +81,8 @@ def shown(
         head = known.head(shot)
         here, normal = (here - head.translation_m) @ head.rotation, normal @ head.rotation
     sight = here.mean(axis=0) - camera.model.C
-    if sight @ normal < FLATTEST * float(np.linalg.norm(sight)):
+    # At a flatter angle between a board and the line of sight no corner is relied on.
+    if sight @ normal < 0.35 * float(np.linalg.norm(sight)):
         return np.zeros(len(here), dtype=bool)
     pixels, valid = camera.model.project(here)
     size = np.array(camera.model.size_px)
@@ -169,7 +154,8 @@ def next_shot(
     if not sought.one_sided:
         # From which side a joint comes shows its backlash alone: it is tried for the best attitudes only.
         beside = base + added[others].sum(axis=0)
-        best = [i for i in np.argsort(_left_px(beside, added, aim)) if i not in others][:SIDES_TRIED]
+        # Of so many of the best attitudes every side of approach is tried.
+        best = [i for i in np.argsort(_left_px(beside, added, aim)) if i not in others][:8]
         sides = [
             replace(
                 choices[i],
@@ -216,7 +202,8 @@ def _together(base: FloatArray, added: FloatArray, aim: ExpectedPointing, count:
         left[plan] = np.inf
         plan.append(int(np.argmin(left)))
         whole = whole + added[plan[-1]]
-    for _ in range(EXCHANGES if len(plan) > 1 else 0):
+    # Rounds in which each of the shots that are chosen together may give way to a better one.
+    for _ in range(2 if len(plan) > 1 else 0):
         before = list(plan)
         for place, index in enumerate(before):
             rest = whole - added[index]
@@ -233,7 +220,8 @@ def _left_px(base: FloatArray, added: FloatArray, aim: ExpectedPointing) -> Floa
     """Return the rms per axis (n,) of pointing that each of some shots (n, p + 6, p + 6) beside ``base``
     would leave, pixels."""
     whole = base + added
-    whole[:, -6:, -6:] += ANYWHERE * np.eye(6)
+    # 1e-6: the prior of a board's pose before any picture: it is within some kilometre (1/m², 1/rad²).
+    whole[:, -6:, -6:] += 1e-6 * np.eye(6)
     scale = 1.0 / np.sqrt(np.einsum("nii->ni", whole))
     whole *= scale[:, :, None] * scale[:, None, :]
     covariance = np.linalg.inv(whole) * scale[:, :, None] * scale[:, None, :]
@@ -262,7 +250,8 @@ def candidates(
     useless = [*avoid, *((shot.pan_rad, shot.tilt_rad) for shot in here)]
     last = (here[-1].pan_rad, here[-1].tilt_rad) if here else (0.0, 0.0)
     for pan, tilt in _attitudes(known, sought, placement):
-        if any(max(abs(a - pan), abs(b - tilt)) < APART_RAD for a, b in useless):
+        # Attitudes near one that did not show the board, or was taken already, are not tried again.
+        if any(max(abs(a - pan), abs(b - tilt)) < 0.02 for a, b in useless):
             continue
         sides = (0, 0) if sought.one_sided else (1 if pan > last[0] else -1, 1 if tilt > last[1] else -1)
         shown = seen(known, sought, BenchShot(placement, pan, tilt, (), *sides))

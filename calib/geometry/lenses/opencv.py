@@ -36,14 +36,10 @@ MOST_TURN_RAD = 1.5
 _DIRECTIONS, _RADII, _STEEPEST = 48, 256, 100.0
 """Where the fold of a lens that is not round is searched for: directions, radii, and the largest slope."""
 
-_ROUNDING = 1e-15
-"""An inverse is settled with a residual this small beside its numbers."""
 
 _FEW_STEPS, _MANY_STEPS = 8, 40
 """Newton's steps for all pixels together, and for those that are not settled then."""
 
-_FIRST = 0.2, 5.0
-"""Bounds of what all pixels' slopes are multiplied by to begin with."""
 
 _PATH = 48
 """Steps from the axis out to a pixel where Newton's own way does not lead to it."""
@@ -294,7 +290,8 @@ class OpencvLens:
 
     def _undistorted(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, np.ndarray]:
         """Undistorted slopes of distorted ones, and which exist."""
-        k = np.clip(1.0 / self._radial(u * u + v * v)[0], *_FIRST)
+        # 0.2, 5.0: bounds of what all pixels' slopes are multiplied by to begin with.
+        k = np.clip(1.0 / self._radial(u * u + v * v)[0], 0.2, 5.0)
         x, y = u * k, v * k
         for _ in range(_FEW_STEPS):
             now_u, now_v, tau, *rates = self._flat(x, y)
@@ -323,7 +320,8 @@ class OpencvLens:
                 off_u, off_v = u - now_u, v - now_v
                 left = np.abs(off_u) + np.abs(off_v)
                 rounding = 1.0 + np.abs(u) + np.abs(v) + np.sqrt(tau) * sum(map(np.abs, rates))
-                rounding *= _ROUNDING
+                # 1e-15: an inverse is settled with a residual this small beside its numbers.
+                rounding *= 1e-15
                 settled = left < 0.5 * rounding
                 if settled.all():
                     break

@@ -37,17 +37,12 @@ from calib.geometry.rigid import FloatArray
 NEAREST_M = 1e-9
 """A point this near the entrance point has no direction from it."""
 
-_EDGE = 1.0 - 1e-15
-"""This part of the largest slope is reached for sure; above it rounding decides."""
 
 _TERMS = 9
 """Terms of the polynomial that an inverse begins with."""
 
 _SETTLED_RAD = 1e-9
 """Newton stops after a step below this: the derivative is good to that part of itself."""
-
-_NODES = 257
-"""Angles at which the slow search for a ray checks for a change of sign."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +137,8 @@ class Entrance:
             y, sine = theta * theta, np.sin(theta)
             return np.asarray(w * sine - lam * np.cos(theta) - (theta - sine) * (e0 + y * (e1 + y * e2)))
 
-        nodes = np.linspace(0.0, self.limit_rad, _NODES)
+        # 257: angles at which the slow search for a ray checks for a change of sign.
+        nodes = np.linspace(0.0, self.limit_rad, 257)
         positive = miss(nodes, lam[:, None], w[:, None]) > 0.0
         rising = ~positive[:, :-1] & positive[:, 1:]
         cell = rising.argmax(axis=1)
@@ -423,7 +419,8 @@ class RoundLens:
             middle = 0.5 * (low + high)
             far = beyond(middle)
             low, high = np.where(far, low, middle), np.where(far, middle, high)
-        return np.asarray(np.minimum(low, _EDGE * self.chi_limit) / t)
+        # 1.0 - 1e-15: this part of the largest slope is reached for sure; above it rounding decides.
+        return np.asarray(np.minimum(low, (1.0 - 1e-15) * self.chi_limit) / t)
 
 
 def _about_axis(out: FloatArray, x: FloatArray, y: FloatArray, even: FloatArray, more: FloatArray) -> None:
