@@ -18,11 +18,9 @@ import numpy as np
 from calib.errors import NoStereoPoint
 from calib.geometry.covariance import (
     MOST_SIGMAS,
-    RIG_PX,
     RayGap,
     click_covariance,
     ray_gap,
-    silent_cameras,
     stored_covariance,
 )
 from calib.geometry.rig import Rig, gimbal, gimbal_rates, numbers_of
@@ -163,11 +161,9 @@ def body_sights(
             continue
         allowed_px2 = click_covariance(
             rig, one.pair, pan_rad, tilt_rad, target.position_m,
-            sigma_px=one.sigma_px, sigma_rad=sigma_rad, calibration=known,
+            sigma_px=one.sigma_px, sigma_rad=sigma_rad, calibration=known, model_px=model_px,
         )  # fmt: skip
-        unknown = silent_cameras(one.pair, known)
-        model_px2 = [RIG_PX**2 if name in unknown else model_px**2 for name in one.pair]
-        gap = ray_gap(target, allowed_px2 + np.diag(np.repeat(model_px2, 2)))
+        gap = ray_gap(target, allowed_px2)
         if gap.sigmas > MOST_SIGMAS:
             apart.append((one, gap))
             continue

@@ -248,21 +248,30 @@ def click_covariance(
     sigma_px: float,
     sigma_rad: float = 0.0,
     calibration: RigCovariance | None = None,
+    model_px: float | None = None,
 ) -> FloatArray:
     """Return the covariance (2k, 2k), px², of a point's clicks in k cameras and of all that is off with them.
 
     ``position_m`` (3,) is the point, rover frame; ``sigma_px`` that of each pixel coordinate of a click,
-    ``sigma_rad`` of each joint reading. The rig is exact without a ``calibration``.
+    ``sigma_rad`` of each joint reading. The rig is exact without a ``calibration``. ``model_px`` is what
+    camera models are wrong by beside that; those of which the calibration says nothing then by ``RIG_PX``.
     """
     total = sigma_px * sigma_px * np.eye(2 * len(cameras))
-    known = calibration.of(cameras) if calibration else None
-    names = (*(known.names if known else ()), *JOINT_NAMES)
+    known = calibration.of(cameras) if calibration else RigCovariance((), np.zeros((0, 0)))
+    names, size = (*known.names, *JOINT_NAMES), len(known.names)
     rates = click_rates(rig, names, cameras, pan_rad, tilt_rad, position_m)
-    if known:
-        by_rig = rates[:, : len(known.names)]
-        total += by_rig @ known.covariance @ by_rig.T
-    turned = rates[:, -2:]
-    return np.asarray(total + sigma_rad * sigma_rad * (turned @ turned.T))
+    by_rig, turned = rates[:, :size], rates[:, size:]
+    total += by_rig @ known.covariance @ by_rig.T + sigma_rad * sigma_rad * (turned @ turned.T)
+    if model_px is not None:
+        unknown = _unknown(cameras, calibration)
+        total += np.diag(np.repeat([RIG_PX**2 if name in unknown else model_px**2 for name in cameras], 2))
+    return np.asarray(total)
+
+
+def _unknown(cameras: Sequence[str], calibration: RigCovariance | None) -> list[str]:
+    """Cameras of whose errors a rig's covariance says nothing: all if there is none."""
+    names = calibration.names if calibration else ()
+    return [one for one in cameras if not any(name.startswith(f"cameras.{one}.") for name in names)]
 
 
 class PlaceRates(NamedTuple):
@@ -337,12 +346,6 @@ def ray_gap(seen: Triangulation, clicks_px2: FloatArray) -> RayGap:
     return RayGap(seen.ray_gap_m, sigma_m, seen.ray_gap_m / per_right_px, sigma_m / per_right_px)
 
 
-def silent_cameras(pair: tuple[str, str], calibration: RigCovariance | None) -> tuple[str, ...]:
-    """Return the cameras of a pair of whose errors a rig's covariance says nothing: all if there is none."""
-    names = calibration.names if calibration else ()
-    return tuple(one for one in pair if not any(name.startswith(f"cameras.{one}.") for name in names))
-
-
 def refuse_two_points(gap: RayGap, pair: tuple[str, str], by: str) -> None:
     """Refuse two clicks whose rays pass each other farther than their noise explains.
 
@@ -388,10 +391,6 @@ def clicked_point(
             )
     left, right = (rig.camera_in_rover(name, pan_rad, tilt_rad) for name in pair)
     seen = triangulate(left, right, left_px, right_px, sigma_px)
-    allowed = click_covariance(
-        rig, pair, pan_rad, tilt_rad, seen.position_m,
-        sigma_px=sigma_px, sigma_rad=sigma_rad, calibration=calibration,
-    )  # fmt: skip
     for name, model in zip(pair, (left, right), strict=True):
         if not model.project(seen.position_m)[1]:
             raise NoStereoPoint(
@@ -399,11 +398,13 @@ def clicked_point(
                 f"the two pixels do not mean one point: their rays pass each other at "
                 f"{1e3 * seen.ray_gap_m:.3g} mm, where {name} sees nothing{model.why_no_ray}",
             )
-    unknown = silent_cameras(pair, calibration)
-    allowed += np.diag(np.repeat([RIG_PX**2 if name in unknown else 0.0 for name in pair], 2))
+    allowed = click_covariance(
+        rig, pair, pan_rad, tilt_rad, seen.position_m,
+        sigma_px=sigma_px, sigma_rad=sigma_rad, calibration=calibration, model_px=0.0,
+    )  # fmt: skip
     gap = ray_gap(seen, allowed)
     by = f"clicks good to {sigma_px:g} px and " + ("the mast file's covariance" if calibration else "the rig")
-    if calibration and unknown:
+    if calibration and (unknown := _unknown(pair, calibration)):
         by += f", which knows nothing of {' and '.join(unknown)},"
     refuse_two_points(gap, pair, by)
     return seen, gap

@@ -42,16 +42,11 @@ MEDIAN_OF_TWO = 2 * np.log(2.0)
 
 
 def chance(chi2: float, freedom: int, scale: float = 1.0, scale_freedom: float = math.inf) -> float:
-    """Return the chance of a larger chi-square without any effect.
+    """Return the chance of a larger chi-square, of so many numbers, without any effect.
 
-    Parameters
-    ----------
-    chi2, freedom
-        Weighted sum of squares that an effect explains, and of how many numbers.
-    scale, scale_freedom
-        The residuals' own chi-square over its degrees of freedom, and these. Above one it says that the
-        stated sigmas are too small; chi2 is then taken by it, and the F distribution counts how well the
-        scale itself is known. Below one it is not used: luck makes no sigma smaller.
+    ``scale`` is the residuals' own chi-square over its degrees of freedom. Above one it says that the stated
+    sigmas are too small; chi2 is then divided by it, and the F distribution allows for how well the scale
+    itself is known. Below one it is not used: luck makes no sigma smaller.
     """
     from scipy.special import chdtrc, fdtrc  # slow to load, and a daemon that starts does not need it
 
@@ -72,15 +67,8 @@ def sigmas(probability: float) -> float:
 
 
 def chance_of_sum(total: float, weights: FloatArray) -> float:
-    """Return the chance of a larger weighted sum of squares of independent unit normals.
+    """Return the chance of a larger sum of squares of independent unit normals with positive weights (n,).
 
-    Parameters
-    ----------
-    total, weights
-        The sum, and what each square counts in it (n,), positive.
-
-    Notes
-    -----
     Lugannani and Rice's saddle point as in Kuonen, Biometrika 86 (1999). A chi-square of the same mean and
     variance is wrong by orders of magnitude far out, where the largest weight decides.
     """

@@ -49,14 +49,7 @@ Slopes = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class OpencvLens:
-    """One lens.
-
-    Attributes
-    ----------
-    distortion
-        The coefficients, 4, 5, 8, 12 or 14 of them.
-
-    A lens that folds at its axis has no image: nothing is reached.
+    """One lens of 4, 5, 8, 12 or 14 coefficients; one that folds at its axis has no image.
 
     Raises
     ------
@@ -98,13 +91,9 @@ class OpencvLens:
         """u and v before the plane is turned, tau, then du/dx, du/dy, dv/dx, dv/dy."""
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = self._numbers
         tau = x * x + y * y
-        if k4 or k5 or k6:
-            r, below = self._radial(tau)
-            rate = 2.0 * k1 + tau * (4.0 * k2 + tau * (6.0 * k3))
-            rate = (rate - r * (2.0 * k4 + tau * (4.0 * k5 + tau * (6.0 * k6)))) / below
-        else:
-            r = 1.0 + tau * (k1 + tau * (k2 + tau * k3))
-            rate = 2.0 * k1 + tau * (4.0 * k2 + tau * (6.0 * k3))
+        r, below = self._radial(tau)
+        rate = 2.0 * k1 + tau * (4.0 * k2 + tau * (6.0 * k3))
+        rate = (rate - r * (2.0 * k4 + tau * (4.0 * k5 + tau * (6.0 * k6)))) / below
         g = r + (2.0 * p1) * y + (2.0 * p2) * x
         gx, gy = x * rate + 2.0 * p2, y * rate + 2.0 * p1  # rate is 2 dr / d tau
         h, j = (p2 + s1) + s2 * tau, (p1 + s3) + s4 * tau

@@ -50,19 +50,18 @@ class Entrance:
     """The entrance point of one lens, e0 to e2.
 
     ``image_rad`` and ``limit_rad`` are the largest angle inside the image, and the first that the lens does
-    not reach. Farther than ``near_m`` from C no two rays of the image meet.
+    not reach.
     """
 
     e: tuple[float, float, float]
     image_rad: float
     limit_rad: float
-    near_m: float
 
-    @staticmethod
-    def of(e: tuple[float, float, float], image_rad: float, limit_rad: float) -> Entrance:
-        """Return it with ``near_m``: how far neighbouring rays of the image cross, with 2 % to spare."""
-        e0, e1, e2 = e
-        theta = np.linspace(0.0, min(image_rad, 0.999 * pi), 513)[1:]
+    @cached_property
+    def near_m(self) -> float:
+        """How far from C neighbouring rays of the image cross, with 2 % to spare: farther none do."""
+        e0, e1, e2 = self.e
+        theta = np.linspace(0.0, min(self.image_rad, 0.999 * pi), 513)[1:]
         y = theta * theta
         along, rate = e0 + y * (e1 + y * e2), theta * (2.0 * e1 + 4.0 * y * e2)
         shift = (theta / np.sin(theta) - 1.0) * along
@@ -70,7 +69,7 @@ class Entrance:
         crossing = along * (1.0 - theta / np.tan(theta)) + (theta - np.sin(theta)) * rate
         ends = np.hypot(shift + crossing * np.cos(theta), crossing * np.sin(theta))
         far = np.maximum(np.abs(shift), ends)[crossing > 0.0]
-        return Entrance(e, image_rad, limit_rad, 1.02 * float(far.max(initial=0.0)))
+        return 1.02 * float(far.max(initial=0.0))
 
     def angle(
         self, lam: FloatArray, w: FloatArray, derivatives: bool
@@ -232,7 +231,7 @@ class RoundLens:
         if self.image_slope < self._distorted_limit:
             (k,) = self._shrink(np.array([self.image_slope**2]))
             image_rad = self._theta_of(k * self.image_slope)
-        return Entrance.of(self.e, image_rad, limit_rad)
+        return Entrance(self.e, image_rad, limit_rad)
 
     def _theta_of(self, chi: float) -> float:
         """Angle of slope ``chi``, at most what the linearity and half a turn allow."""
