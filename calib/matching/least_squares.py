@@ -20,6 +20,7 @@ where few strong edges fix the place, since these are what the fit has fitted.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import pairwise, product
 
@@ -141,7 +142,7 @@ def _alike(fit: _PatchFit, surface: Surface, q: FloatArray, t: FloatArray, count
     from scipy import ndimage  # slow to load, and a daemon that starts does not need it
 
     seen = surface.at(fit.position + q + q @ fit.deformation.T)
-    gain, offset = _Photometry(t, counts).of(seen)
+    gain, offset = _photometry(t, counts)(seen)
     # One sigma of the Gaussian by which neighbours say together that a place shows something else.
     total, rest = (
         ndimage.gaussian_filter(values, 4.0, mode="constant")
@@ -229,13 +230,13 @@ def _settled(
     if not float(np.abs(normal).max() * np.abs(inverse).max()) < 1e15:
         return None
     position, deformation = fit.position, fit.deformation
-    photometry = _Photometry(t, counts)
+    photometry = _photometry(t, counts)
     for _ in range(12):
         places = position + q + q @ deformation.T
         if not surface.inside(places[[0, 0, -1, -1], [0, -1, 0, -1]]):  # the corners
             return None
         seen = surface.at(places)
-        gain, offset = photometry.of(seen)
+        gain, offset = photometry(seen)
         if gain <= 0.05:
             return None
         rest = (seen - gain * t - offset).reshape(-1)
@@ -271,16 +272,15 @@ def _columns(gradient: FloatArray, q: FloatArray, t: FloatArray) -> FloatArray:
     return np.concatenate([gradient, deformed, -t[..., None], -np.ones_like(t)[..., None]], axis=-1)
 
 
-class _Photometry:
-    """Gain and offset that bring a template (h, w), weighted by ``counts``, nearest to what is seen."""
+def _photometry(template: FloatArray, counts: FloatArray) -> Callable[[FloatArray], tuple[float, float]]:
+    """Return what gives gain and offset that bring a weighted template (h, w) nearest to what is seen."""
+    shares, t = counts.reshape(-1) / float(counts.sum()), template.reshape(-1)
+    mean = float(shares @ t)
+    weights = shares * (t - mean)
+    variance = max(float(weights @ t), 1e-12)
 
-    def __init__(self, template: FloatArray, counts: FloatArray) -> None:
-        self._shares = counts.reshape(-1) / float(counts.sum())
-        self._mean = float(self._shares @ template.reshape(-1))
-        self._weights = self._shares * (template.reshape(-1) - self._mean)
-        self._variance = max(float(self._weights @ template.reshape(-1)), 1e-12)
+    def brought(seen: FloatArray) -> tuple[float, float]:
+        gain = float(weights @ seen.reshape(-1)) / variance
+        return gain, float(shares @ seen.reshape(-1)) - gain * mean
 
-    def of(self, seen: FloatArray) -> tuple[float, float]:
-        """Return gain and offset of a seen patch (h, w)."""
-        gain = float(self._weights @ seen.reshape(-1)) / self._variance
-        return gain, float(self._shares @ seen.reshape(-1)) - gain * self._mean
+    return brought

@@ -164,7 +164,7 @@ def _across(
     """Return the signed distance of the partner pixel from the epipolar line, and its sigma."""
     ray = camera.ray(pixel)
     range_m = float((plane.point_m - ray.origins_m) @ ray.directions)
-    ends, _ = partner.project(ray.origins_m + np.array([[0.99], [1.0], [1.01]]) * range_m * ray.directions)
-    along = ends[2] - ends[0]
+    place, rate, _ = partner.project_jacobian(ray.origins_m + range_m * ray.directions)
+    along = rate @ ray.directions
     normal = np.array([-along[1], along[0]]) / np.linalg.norm(along)
-    return float(normal @ (found.pixel_px - ends[1])), float(np.sqrt(normal @ found.covariance_px2 @ normal))
+    return float(normal @ (found.pixel_px - place)), float(np.sqrt(normal @ found.covariance_px2 @ normal))

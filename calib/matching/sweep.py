@@ -40,13 +40,8 @@ class Swept:
     second: float
 
 
-@dataclass(frozen=True, eq=False)
-class _Patch:
-    """The source patch of a sweep, with the rays of its nine knots."""
-
-    values: NDArray[np.float32]
-    knots: Rays
-    weights: NDArray[np.float32]
+_Patch = tuple[NDArray[np.float32], Rays, NDArray[np.float32]]
+"""The values of a source patch (n,), the rays of its nine knots, and each pixel's weights of these (n, 9)."""
 
 
 def sweep(
@@ -146,7 +141,7 @@ def _patch(own: PosedImage, pixel: FloatArray, half: int, step: int) -> _Patch:
     length = float(np.linalg.norm(values))
     knots = own.camera.ray(pixel + square_grid(1).reshape(9, 2) * (count * step))
     weights = np.einsum("yj,xi->yxji", quadratic(count), quadratic(count)).reshape(len(values), 9)
-    return _Patch(values / max(length, 1e-6), knots, weights.astype(np.float32))
+    return values / max(length, 1e-6), knots, weights.astype(np.float32)
 
 
 def _scores(
@@ -161,22 +156,23 @@ def _scores(
 
     The map of a patch is biquadratic through its nine knots, each carried exactly.
     """
+    values, knots, weights = patch
     points = ray.origins_m + ray.directions / inverse[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
-        slope = normals @ patch.knots.directions.T  # (k, 9)
-        ahead = np.einsum("mkjc,kc->mkj", points[:, None, None] - patch.knots.origins_m, normals)
+        slope = normals @ knots.directions.T  # (k, 9)
+        ahead = np.einsum("mkjc,kc->mkj", points[:, None, None] - knots.origins_m, normals)
         ranges = ahead / slope
         ranges = np.where((ranges > 0) & (np.abs(slope) > GRAZING), ranges, np.nan)
-        hits = patch.knots.origins_m + ranges[..., None] * patch.knots.directions
+        hits = knots.origins_m + ranges[..., None] * knots.directions
     pixels, _ = partner.camera.project(hits)  # (m, k, 9, 2)
     m, k = pixels.shape[:2]
     known = np.isfinite(pixels).all(axis=(2, 3)).reshape(m * k)
     maps = np.where(np.isfinite(pixels), pixels / step, 0.0).astype(np.float32).reshape(m * k, 9, 2)
-    map_x, map_y = maps[..., 0] @ patch.weights.T, maps[..., 1] @ patch.weights.T
+    map_x, map_y = maps[..., 0] @ weights.T, maps[..., 1] @ weights.T
     seen = cv2.remap(partner.image, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     seen -= seen.mean(axis=1, keepdims=True)
     length = np.sqrt(np.einsum("ij,ij->i", seen, seen))
-    scores = (seen @ patch.values) / np.maximum(length, 1e-3)
+    scores = (seen @ values) / np.maximum(length, 1e-3)
     return np.where(known, scores, np.float32(-1.0)).astype(np.float32).reshape(m, k)
 
 

@@ -209,10 +209,9 @@ def parallax_px_m(camera: CameraModel, pixel_px: FloatArray, plane: Plane, other
     The point is where the ray of ``pixel_px`` (2,) of ``camera`` meets the plane.
     """
     ray = camera.ray(pixel_px)
-    inverse_m = float(ray.directions @ plane.normal) / float((plane.point_m - ray.origins_m) @ plane.normal)
-    step = 1e-3 * inverse_m
-    ends, _ = other.project(ray.origins_m + ray.directions / (inverse_m + np.array([[-step], [step]])))
-    return np.asarray((ends[1] - ends[0]) / (2.0 * step))
+    range_m = float(plane.ranges_m(ray))
+    _, rate, _ = other.project_jacobian(ray.origins_m + range_m * ray.directions)
+    return np.asarray(-(range_m**2) * (rate @ ray.directions))
 
 
 def warp_patch(

@@ -244,7 +244,6 @@ def _joints(view: CameraView) -> Joints:
     return Joints(*frame.true_rad, JOINT_SIGMA_RAD, (frame.pan_approach, frame.tilt_approach))
 
 
-STEP_M = 1e-3  # of the differences; a camera's curvature over it is far below a pixel
 LEAST_ELLIPSE_PX = 0.05
 
 
@@ -264,14 +263,12 @@ def in_picture(camera: CameraModel, position_m: ArrayLike, covariance_m2: object
         ``x_px``, ``y_px``, ``major_px``, ``minor_px`` (half axes), ``turn_rad`` (of the major one, from x
         towards y); None if the camera does not show the point.
     """
-    point = np.asarray(position_m, dtype=float)
-    places, valid = camera.project(np.vstack([point, point + STEP_M * np.eye(3)]))
-    if not bool(np.all(valid)) or not camera.holds(places[0]):
+    place, rates, valid = camera.project_jacobian(position_m)
+    if not bool(valid) or not camera.holds(place):
         return None
-    told = {"x_px": float(places[0, 0]), "y_px": float(places[0, 1])}
+    told = {"x_px": float(place[0]), "y_px": float(place[1])}
     if covariance_m2 is None:
         return told | {"major_px": 0.0, "minor_px": 0.0, "turn_rad": 0.0}
-    rates = (places[1:] - places[0]).T / STEP_M
     variances, axes = np.linalg.eigh(rates @ np.asarray(covariance_m2, dtype=float) @ rates.T)
     minor, major = (max(LEAST_ELLIPSE_PX, math.sqrt(max(0.0, one))) for one in variances.tolist())
     return told | {
