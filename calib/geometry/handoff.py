@@ -129,29 +129,38 @@ def hand_off(
         rig, pair, joints.pan_rad, joints.tilt_rad, left_px, right_px,
         sigma_px=sigma_px, sigma_rad=joints.sigma_rad, calibration=calibration,
     )  # fmt: skip
-    models = [rig.camera_in_rover(name, joints.pan_rad, joints.tilt_rad) for name in pair]
-    _refuse_range(seen, models, pair)
-    there = to_joints or joints
+    _refuse_range(seen, [rig.camera_in_rover(name, joints.pan_rad, joints.tilt_rad) for name in pair], pair)
+    there, position = to_joints or joints, seen.position_m
     cameras = {name: rig.camera_in_rover(name, there.pan_rad, there.tilt_rad) for name in to}
-    reasons = {name: why for name, model in cameras.items() if (why := _unseen(model, seen.position_m))}
+    reasons = {name: why for name, model in cameras.items() if (why := _unseen(model, position))}
     shown = [name for name in to if name not in reasons]
     if not shown:
         whys = "; ".join(f"{name}: {why}" for name, why in reasons.items())
         raise NoHandoff("not_seen", f"no destination camera sees the target: {whys}")
 
-    total = _other_covariance(rig, pair, shown, joints, to_joints, seen, calibration)
-    places, rates = [], []
-    for name in shown:
-        pixel, rate, _ = cameras[name].project_jacobian(seen.position_m)
-        places.append(np.asarray(pixel))
-        rates.append(rate)
-    both = np.concatenate(rates)
+    # How position (3) and pixels (2n) follow calibration and joint readings, of which the last are there.
+    known = calibration.of((*pair, *shown)) if calibration else RigCovariance((), np.zeros((0, 0)))
+    names, size = (*known.names, *JOINT_NAMES), len(known.names)
+    readings = [joints] if to_joints is None else [joints, to_joints]
+    clicked = click_rates(rig, names, pair, joints.pan_rad, joints.tilt_rad, position, joints.approach)
+    views = [
+        pixel_rates(rig, names, name, there.pan_rad, there.tilt_rad, position[None], there.approach)
+        for name in shown
+    ]
+    both = np.concatenate([view.to_points[0] for view in views])
+    rates = np.zeros((3 + 2 * len(shown), size + 2 * len(readings)))
+    rates[:3, : size + 2] = seen.rates_m_per_px @ clicked
+    rates[3:] = both @ rates[:3]
+    rates[3:, [*range(size), -2, -1]] += np.concatenate([view.to_rig[0] for view in views])
+    turned = np.repeat([reading.sigma_rad for reading in readings], 2) * rates[:, size:]
+    total = rates[:, :size] @ known.covariance @ rates[:, :size].T + turned @ turned.T
+
     clicks = both @ seen.covariance_m2 @ both.T
     joint = clicks + total[3:, 3:]
     pixels: dict[str, PredictedPixel | None] = dict.fromkeys(to)
-    for row, name in enumerate(shown):
+    for row, (name, view) in enumerate(zip(shown, views, strict=True)):
         part = (slice(2 * row, 2 * row + 2),) * 2
-        pixels[name] = PredictedPixel(places[row], clicks[part], joint[part])
+        pixels[name] = PredictedPixel(view.pixels_px[0], clicks[part], joint[part])
     position_m2 = seen.covariance_m2 + total[:3, :3]
     return Handoff(seen, gap, position_m2, pixels, joint, reasons, there.pan_rad, there.tilt_rad)
 
@@ -189,32 +198,3 @@ def _unseen(model: CameraModel, position_m: FloatArray) -> str:
     return (
         f"the target falls on pixel ({pixel[0]:.1f}, {pixel[1]:.1f}), outside the image of {width} x {height}"
     )
-
-
-def _other_covariance(
-    rig: Rig,
-    pair: tuple[str, str],
-    to: Sequence[str],
-    joints: Joints,
-    to_joints: Joints | None,
-    seen: Triangulation,
-    calibration: RigCovariance | None,
-) -> FloatArray:
-    """Covariance (3 + 2n, 3 + 2n) of position and pixels from joint readings and calibration."""
-    known = calibration.of((*pair, *to)) if calibration else RigCovariance((), np.zeros((0, 0)))
-    readings = [joints] if to_joints is None else [joints, to_joints]
-    names, calibrated = (*known.names, *JOINT_NAMES), len(known.names)
-    width = calibrated + 2 * len(readings)
-    then = [*range(calibrated), width - 2, width - 1]  # the destination's reading is the last
-    rates = np.zeros((3 + 2 * len(to), width))
-    clicked = click_rates(rig, names, pair, joints.pan_rad, joints.tilt_rad, seen.position_m, joints.approach)
-    rates[:3, : calibrated + 2] = seen.rates_m_per_px @ clicked
-    at, point = readings[-1], seen.position_m[None]
-    for row, name in enumerate(to):
-        part = slice(3 + 2 * row, 5 + 2 * row)
-        seen_by = pixel_rates(rig, names, name, at.pan_rad, at.tilt_rad, point, at.approach)
-        rates[part] = seen_by.to_points[0] @ rates[:3]
-        rates[part, then] += seen_by.to_rig[0]
-    turned = np.repeat([reading.sigma_rad for reading in readings], 2) * rates[:, calibrated:]
-    by_rig = rates[:, :calibrated]
-    return np.asarray(by_rig @ known.covariance @ by_rig.T + turned @ turned.T)
