@@ -277,7 +277,7 @@ class RigCamera:
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """A mast with its cameras: what a mast file holds.
+    """A mast with its cameras: the content of a mast file.
 
     ``stereo`` maps a pair name to its (left, right) camera names. ``joints`` are the errors of the head's
     readings: all other angles are true ones. ``fit`` and ``provenance`` are carried through unread.

@@ -1,8 +1,8 @@
 """Which view a picture shows: its joint angles by what it shares with an earlier picture of the same camera.
 
-Some twenty textured patches of the earlier picture are looked for where the joint angles reported for the
+Some twenty textured patches of the earlier picture are searched for where the joint angles reported for the
 later one put them. Every found patch is a vote for two angles; the view is the majority's. If that is not the
-reported one, or none is found, the patches are looked for in the whole picture, and the angles solved for.
+reported one, or none is found, the patches are searched for in the whole picture, and the angles solved for.
 
 Rotation moves a picture as a whole, whatever its range; the way of the camera with the head moves near things
 further. Ranges come from the other camera of the earlier moment where there is one. Without it a patch may be
@@ -57,7 +57,7 @@ class Posed:
 
     @cached_property
     def reduced(self) -> Reduced:
-        """The picture as patches are looked for in it."""
+        """The picture as patches are searched for in it."""
         return Reduced.of(self.image)
 
     @cached_property
@@ -383,7 +383,7 @@ class _Comparison:
 
 
 def _spread(which: NDArray[np.intp]) -> NDArray[np.intp]:
-    """As many as are looked for, evenly, so that no one thing of strong contrast has them all."""
+    """As many as are searched for, evenly, so that no one thing of strong contrast has them all."""
     if len(which) <= MOST_PATCHES:
         return which
     return np.asarray(which[np.linspace(0, len(which) - 1, MOST_PATCHES).round().astype(int)])
