@@ -140,7 +140,7 @@ def solve_many(
     rays = camera_in_head.ray(np.broadcast_to(pixels, (*shape, 2)))
     every_target = np.broadcast_to(targets, (*shape, 3))
     found = np.full((3, *shape, _MOST), np.nan)
-    refused = np.full(shape, "", dtype="<U16")
+    refused = np.full(shape, "", dtype="<U10")
     for at in np.ndindex(shape):
         try:
             if not rays.valid[at]:
