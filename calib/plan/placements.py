@@ -7,7 +7,7 @@ taken, each placement shows it the board once.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -15,10 +15,10 @@ import numpy as np
 
 from calib.adjust.solver import covariance_of
 from calib.errors import CalibError, Unreachable
-from calib.geometry.parameters import predict
+from calib.geometry.covariance import pixel_rates
 from calib.geometry.rigid import FloatArray, Rigid
 from calib.plan.knowledge import BenchShot, ExpectedPointing, Knowledge, without_board
-from calib.plan.poses import Sought, readings, seen
+from calib.plan.poses import Sought, readings, seen, shown
 
 RANGES_M = (0.8, 1.2, 1.8, 2.6)
 BEARINGS_DEG = (-50.0, -25.0, 0.0, 25.0, 50.0)
@@ -153,16 +153,21 @@ def advise(
     rng = np.random.default_rng(seed)
     if len(every) > most:
         every = [every[k] for k in sorted(rng.choice(len(every), most, replace=False))]
+    return _best(known, sought, shots, every, aim.rms_px)
+
+
+def _best(
+    known: Knowledge,
+    sought: Sought,
+    shots: Collection[BenchShot],
+    tried: Iterable[Placement],
+    left_px: Callable[[FloatArray], float],
+) -> Advice | None:
+    """The placement that leaves least by ``left_px`` of a covariance; None if none can be seen."""
     base = known.information(shots)
-    best: Advice | None = None
-    for placement in every:
-        added = information_of(known, sought, placement)
-        if added is None:
-            continue
-        rms = aim.rms_px(covariance_of(base + added))
-        if best is None or rms < best.expected_px:
-            best = Advice(placement, rms)
-    return best
+    found = [(one, information_of(known, sought, one)) for one in tried]
+    advice = [Advice(one, left_px(covariance_of(base + added))) for one, added in found if added is not None]
+    return min(advice, key=lambda one: one.expected_px, default=None)
 
 
 def information_of(known: Knowledge, sought: Sought, placement: Placement) -> FloatArray | None:
@@ -178,9 +183,9 @@ def information_of(known: Knowledge, sought: Sought, placement: Placement) -> Fl
         except (Unreachable, CalibError, ValueError):
             continue
         side = 0 if sought.one_sided else 1 if k % 2 else -1
-        shown = seen(supposed, sought, BenchShot("", pan, tilt, (), side, side))
-        if shown is not None:
-            added.append(supposed.of_shot(shown))
+        shot = seen(supposed, sought, BenchShot("", pan, tilt, (), side, side))
+        if shot is not None:
+            added.append(supposed.of_shot(shot))
     if len(added) < 3:
         return None
     return without_board(np.sum(added, axis=0))
@@ -208,15 +213,12 @@ def body_px(known: Knowledge, covariance: FloatArray, camera: str) -> float:
     ``covariance`` is that of ``known.names``.
     """
     model = known.rig.cameras[camera].model
-    width, height = model.size_px
-    x, y = np.meshgrid(*((np.arange(GRID) + 0.5) / GRID * size for size in (width, height)))
+    x, y = np.meshgrid(*((np.arange(GRID) + 0.5) / GRID * size for size in model.size_px))
     rays = model.ray(np.stack([x.ravel(), y.ravel()], axis=-1))
     points = rays.origins_m[rays.valid] + 2.0 * rays.directions[rays.valid]
-    seen = predict(model, points)
-    rates = seen.d_step[seen.valid]
-    mine = [k for k, name in enumerate(known.names) if name.startswith(f"cameras.{camera}.")]
-    squares = np.einsum("nip,pq,niq->ni", rates, covariance[np.ix_(mine, mine)], rates)
-    return float(np.sqrt(np.mean(squares)))
+    rates = pixel_rates(known.rig, known.names, camera, 0.0, 0.0, points).to_rig
+    rates = rates[np.isfinite(rates).all(axis=(1, 2))]
+    return float(np.sqrt(np.mean(np.einsum("nip,pq,niq->ni", rates, covariance, rates))))
 
 
 def advise_for_body(
@@ -224,29 +226,22 @@ def advise_for_body(
 ) -> Advice | None:
     """Return the most informative placement for some body cameras, or None if none shows them a board that
     the head can see. ``expected_px`` is the error of their pixels afterwards."""
-    base = known.information(shots)
-    best: tuple[int, float, Placement] | None = None
     head = known.rig.mast.rover_from_head(0.0, 0.0)
     # 0.3: how far below a body camera the middle of a board is assumed to fit over the ground.
     lowest_m = max(known.rig.cameras[name].model.C[2] for name in body_cameras(known)) + 0.3
+    by_count: dict[int, list[Placement]] = {}
     for placement in _places(sought, RANGES_M, BODY_HEIGHTS_DEG):
-        if placement.rover_from_board(head).translation_m[2] > lowest_m:
-            continue
-        see = _sees(known, sought, placement) & set(cameras)
-        added = information_of(known, sought, placement) if see else None
-        if added is None:
-            continue
-        covariance = covariance_of(base + added)
-        off_px = float(np.mean([body_px(known, covariance, name) for name in cameras]))
-        if best is None or (-len(see), off_px) < best[:2]:
-            best = -len(see), off_px, placement
-    return None if best is None else Advice(best[2], best[1])
+        pose = placement.rover_from_board(head)
+        if pose.translation_m[2] <= lowest_m:
+            supposed, shot = replace(known, boards={"": pose}), BenchShot("", 0.0, 0.0, ())
+            see = [shown(supposed, sought, shot, name).sum() >= sought.least for name in cameras]
+            by_count.setdefault(sum(see), []).append(placement)
 
+    def left_px(covariance: FloatArray) -> float:
+        return float(np.mean([body_px(known, covariance, name) for name in cameras]))
 
-def _sees(known: Knowledge, sought: Sought, placement: Placement) -> set[str]:
-    """Which body cameras see a board at a place."""
-    pose = placement.rover_from_board(known.rig.mast.rover_from_head(0.0, 0.0))
-    fixed = {name: known.rig.cameras[name] for name in body_cameras(known)}
-    on_body = Knowledge(replace(known.rig, cameras=fixed, stereo={}), {"": pose})
-    shown = seen(on_body, sought, BenchShot("", 0.0, 0.0, ()))
-    return set() if shown is None else {view.camera for view in shown.views}
+    # The more of the cameras see the board the better.
+    for count in sorted(by_count.keys() - {0}, reverse=True):
+        if advice := _best(known, sought, shots, by_count[count], left_px):
+            return advice
+    return None
