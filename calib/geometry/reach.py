@@ -64,21 +64,8 @@ class Arm:
         # u_y = y_0 + y_1 sigma, from w_y = u_y cos k + z sin k
         y_1 = self.d[1] / self.cos_k
         y_0 = (self.c[1] - self.along * self.d[1] - z * self.sin_k) / self.cos_k
-        if a == 0.0:
-            if reach2 < 0.0:
-                return
-            root = math.sqrt(reach2)
-            for sigma in (root, -root):
-                s = sigma - self.along
-                u_y = y_0 + y_1 * sigma
-                if s > 0.0 and abs(u_y) <= rho + slack:
-                    u_x = math.sqrt(max(0.0, (rho - u_y) * (rho + u_y)))
-                    yield u_x, u_y, s
-                    yield -u_x, u_y, s
-            return
-
-        # a ≠ 0: sigma² = reach2 - 2 a u_x, so u_x within ±rho bounds sigma. With sigma = b + a t and
-        # b² = reach2, the quartic u_x² + u_y² = rho² stays well scaled however small a is:
+        # sigma² = reach2 - 2 a u_x, so u_x within ±rho bounds sigma. With sigma = b + a t and b² = reach2
+        # the quartic u_x² + u_y² = rho² stays well scaled however small a is, and is a quadratic for a = 0:
         #     u_x = excess/2 - b t - a t²/2,     excess = 0 (or reach2/a with b = 0 where reach2 < 0).
         widest = rho * (1.0 + 1e-9) + slack
         if reach2 + 2.0 * abs(a) * widest <= 0.0:
