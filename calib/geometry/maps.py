@@ -60,15 +60,12 @@ def ideal_camera(model: CameraModel, focal_px: float | None = None) -> CameraMod
     return CameraModel("CAHV", model.size_px, model.C, a, fx * x + cx * a, fy * y + cy * a)
 
 
-def maps_between(ideal: CameraModel, model: CameraModel, range_m: float = FAR_M) -> Maps:
-    """Return the maps that make of a picture of ``model`` the one that ``ideal``, in one frame, would take.
-
-    ``range_m`` says how far the things are, if the two are not at one point.
-    """
+def maps_between(ideal: CameraModel, model: CameraModel) -> Maps:
+    """Return the maps that make of a picture of ``model`` the one that ``ideal`` would take."""
     width, height = ideal.size_px
     x, y = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
     rays = ideal.ray(np.stack([x, y], axis=-1))
-    pixels, valid = model.project(rays.origins_m + range_m * rays.directions)
+    pixels, valid = model.project(rays.origins_m + FAR_M * rays.directions)
     pixels[~valid] = NOWHERE
     map_x, map_y = np.ascontiguousarray(np.moveaxis(pixels, -1, 0), dtype=np.float32)
     return Maps(map_x, map_y)

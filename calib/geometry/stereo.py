@@ -276,34 +276,22 @@ def stereo_range_error_m(
 
 
 def target_approach_budget(
-    pairs: tuple[tuple[str, float, float], ...] = PAPER_PAIRS,
-    *,
-    pixel_m: float = PIXEL_M,
-    start_m: float = 10.0,
-    end_m: float = 1.0,
-    disparity_error_px: float = 1.0,
-    odometry_error: float = 0.02,
+    pairs: tuple[tuple[str, float, float], ...] = PAPER_PAIRS, pixel_m: float = PIXEL_M
 ) -> tuple[BudgetRow, ...]:
-    """Return the rows of Table I, one for each pair as the one the approach starts with.
+    """Return the rows of Table I, one for each pair as the one the approach from 10 m to 1 m starts with.
 
-    Parameters
-    ----------
-    pairs
-        From the longest focal length to the shortest; the last is the one that places the instrument.
-    pixel_m
-        Pixel size, metres; with the focal length it gives the focal length in pixels, eq. (2).
-    start_m, end_m
-        Distance to the target before and after the approach.
-    disparity_error_px, odometry_error
-        3 sigma: of stereo at the start, and of navigation as a part of ``start_m``.
+    The pairs go from the longest focal length to the shortest; the last is the one that places the
+    instrument. The pixel size gives focal lengths in pixels, eq. (2). 3 sigma are 1 pixel of stereo at the
+    start, and 2 % of the distance there of navigation.
 
     Notes
     -----
-    While the target grows from start_m to end_m its place in the image is known no better than the first
-    pixel was. The paper takes half of that growth as the disparity error at the end: ±5 pixels for 10 m to
-    1 m. A hand-off scales it by the ratio of focal lengths, so that the focal length of the first camera
-    stays in eq. (4) and the baseline is the last camera's.
+    While the target grows its place in the image is known no better than the first pixel was. The paper takes
+    half of that growth as the disparity error at the end: ±5 pixels. A hand-off scales it by the ratio of
+    focal lengths, so that the focal length of the first camera stays in eq. (4) and the baseline is the last
+    camera's.
     """
+    start_m, end_m, disparity_error_px, odometry_error = 10.0, 1.0, 1.0, 0.02
     grown_error_px = 0.5 * disparity_error_px * start_m / end_m
     rows = []
     for name, focal_m, baseline_m in pairs:

@@ -158,11 +158,8 @@ class HandoffBias:
         )
 
 
-def handoff_bias(handoffs: Sequence[MatchedHandoff], model_px: float = MODEL_PX) -> tuple[HandoffBias, ...]:
-    """Return the mean offset of each destination camera with at least two accepted matches of one mast file.
-
-    ``model_px`` is one sigma, each axis, of what a match is wrong by beyond its own covariance.
-    """
+def handoff_bias(handoffs: Sequence[MatchedHandoff]) -> tuple[HandoffBias, ...]:
+    """Return the mean offset of each destination camera with two accepted matches of one mast file or more."""
     groups: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
     for one in handoffs:
         source = one.pair[0].rpartition("_")[0]
@@ -170,7 +167,7 @@ def handoff_bias(handoffs: Sequence[MatchedHandoff], model_px: float = MODEL_PX)
             assert landed.found_px is not None and landed.found_covariance_px2 is not None
             covariance = landed.geometric_covariance_px2 + landed.found_covariance_px2
             groups.setdefault((source, camera), []).append(
-                (landed.found_px - landed.geometric_px, covariance + model_px**2 * np.eye(2))
+                (landed.found_px - landed.geometric_px, covariance + MODEL_PX**2 * np.eye(2))
             )
     return tuple(
         _mean(source, camera, np.array([o for o, _ in seen]), np.array([c for _, c in seen]))

@@ -19,7 +19,7 @@ from calib.geometry.handoff import Handoff, PredictedPixel
 from calib.geometry.rigid import FloatArray
 from calib.matching.partner import find_partner
 from calib.matching.patch import match_patch
-from calib.matching.verdict import MatchSettings, PatchMatch, worst_px2
+from calib.matching.verdict import worst_px2
 from calib.matching.warp import Plane, PosedImage
 
 RefinedVerdict = Literal["accepted", "ambiguous", "flat", "occluded", "unseen"]
@@ -90,23 +90,22 @@ def refine_handoff(
     clicks_px: FloatArray,
     destinations: Mapping[str, PosedImage],
     settings: RefineSettings | None = None,
-    match_settings: MatchSettings | None = None,
 ) -> dict[str, RefinedPixel]:
     """Search a handed-over target in the destination's pictures, by camera as in ``handoff.pixels``.
 
     ``source`` are the pictures of the pair that sees the target, left one first, ``clicks_px`` (2, 2) the
     target in both; ``destinations`` all those pictures that should show it.
     """
-    settings, sizes = settings or RefineSettings(), match_settings or MatchSettings()
+    settings = settings or RefineSettings()
     clicks = np.asarray(clicks_px, dtype=np.float64)
-    surface = _surface(source, clicks, sizes, settings)
+    surface = _surface(source, clicks, settings)
     refined: dict[str, RefinedPixel] = {}
     for name, image in destinations.items():
         predicted = handoff.pixels.get(name)
         if predicted is None:
             refined[name] = _none("unseen", handoff.reasons.get(name, "the hand-off has no such camera"))
         elif isinstance(surface, Plane):
-            refined[name] = _searched(source[0], clicks[0], surface, image, predicted, settings, sizes)
+            refined[name] = _searched(source[0], clicks[0], surface, image, predicted, settings)
         else:
             refined[name] = surface
     accepted = {name: one for name, one in refined.items() if one.verdict == "accepted"}
@@ -121,14 +120,11 @@ def refine_handoff(
 
 
 def _surface(
-    source: tuple[PosedImage, PosedImage],
-    clicks_px: FloatArray,
-    sizes: MatchSettings,
-    settings: RefineSettings,
+    source: tuple[PosedImage, PosedImage], clicks_px: FloatArray, settings: RefineSettings
 ) -> Plane | RefinedPixel:
     """The surface around the target from the source pair, or why there is none."""
     left, right = source
-    found = find_partner(left, clicks_px[0], right, settings=sizes)
+    found = find_partner(left, clicks_px[0], right)
     if found.match.verdict != "good" or found.plane is None:
         return _none(_VERDICTS[found.match.verdict], f"in the source pair: {found.match.reason}")
     apart_px = float(np.linalg.norm(found.match.pixel_px - clicks_px[1]))
@@ -149,12 +145,11 @@ def _searched(
     image: PosedImage,
     predicted: PredictedPixel,
     settings: RefineSettings,
-    sizes: MatchSettings,
 ) -> RefinedPixel:
     """Search one destination picture."""
     search = settings.sigmas * math.sqrt(worst_px2(predicted.search_px2))
     search = min(max(search, settings.least_px), settings.most_px)
-    found: PatchMatch = match_patch(source, pixel_px, surface, image, search, sizes)
+    found = match_patch(source, pixel_px, surface, image, search)
     scores = (found.correlation, found.second)
     # Whether the patch fits into the picture wherever in the window the target is.
     if not image.camera.holds(found.predicted_px, search + found.half_px + 0.5):

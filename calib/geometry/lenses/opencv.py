@@ -184,9 +184,6 @@ class OpencvLens:
     def limit_reason(self) -> str:
         """Where the lens ends, as the end of a sentence."""
         near, _ = self._folds
-        edge = self._plane_edge
-        if edge < near:
-            return f"the turned image plane ends {degrees(atan(edge)):.1f} degrees from the axis, on one side"
         if near >= _STEEPEST:
             return "the lens ends 90 degrees from its axis"
         return f"the lens folds at {degrees(atan(near)):.1f} degrees from its axis (slope {near:.3g})"
@@ -195,17 +192,6 @@ class OpencvLens:
     def limit_rad(self) -> float:
         """The angle from the axis up to which the lens folds in no direction."""
         return atan(self._folds[0])
-
-    @property
-    def _plane_edge(self) -> float:
-        """The slope at which a turned image plane first runs along the rays; infinite if nowhere."""
-        if self._tilt is None:
-            return inf
-        p, q, s = self._tilt[2].tolist()
-        per = -s / (p * p + q * q)
-        with np.errstate(all="ignore"):
-            x, y, valid = self._undistorted(np.array([per * p]), np.array([per * q]))
-        return float(np.hypot(x, y)[0]) if valid[0] else inf
 
     @cached_property
     @np.errstate(all="ignore")

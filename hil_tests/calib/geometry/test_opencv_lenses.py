@@ -216,12 +216,3 @@ def test_numbers_come_back_from_a_camera_to_the_last_bit() -> None:
             CameraModel.of_matrix("OPENCV4", SIZE, wrong, [0.0] * 4, np.eye(3), np.zeros(3))
     with pytest.raises(ValueError, match="no rotation"):
         CameraModel.of_matrix("OPENCV4", SIZE, MATRIX, [0.0] * 4, 2.0 * np.eye(3), np.zeros(3))
-
-
-@pytest.mark.parametrize("turn_rad", [(0.5, 0.0), (0.0, -0.7)])
-def test_a_turned_image_plane_is_told_to_end_where_it_runs_along_the_rays(
-    turn_rad: tuple[float, float],
-) -> None:
-    model = camera("OPENCV14", [*12 * [0.0], *turn_rad])
-    angle = 90.0 - np.degrees(max(np.abs(turn_rad)))
-    assert model.limit_reason == f"the turned image plane ends {angle:.1f} degrees from the axis, on one side"
