@@ -159,7 +159,7 @@ class HandoffBias:
 
 
 def handoff_bias(handoffs: Sequence[MatchedHandoff]) -> tuple[HandoffBias, ...]:
-    """Return the mean offset of each destination camera with two accepted matches of one mast file or more."""
+    """Return the mean offset of each camera with two or more accepted matches of one mast file."""
     groups: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
     for one in handoffs:
         source = one.pair[0].rpartition("_")[0]
