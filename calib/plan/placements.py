@@ -48,21 +48,19 @@ class Placement:
     height_deg: float
     turned_deg: tuple[float, float] = (0.0, 0.0)
 
-    def words(self) -> str:
-        """Return the placement as one says it to a person."""
+    def __str__(self) -> str:
+        """The placement as one says it to a person."""
         side = _side(self.bearing_deg, "left", "right", "straight ahead")
         level = _side(self.height_deg, "below", "above", "")
-        where = f"{side} at the head's height" if not level else f"{side}, {level} the head's height"
+        where = f"{side}, {level} the head's height" if level else f"{side} at the head's height"
+        right, up = self.turned_deg
+        sides = (("to the right", "to the left"), ("upwards", "downwards"))
         turned = [
-            f"turned {abs(angle):.0f} degrees {word}"
-            for angle, word in (
-                (self.turned_deg[0], "to the right" if self.turned_deg[0] > 0 else "to the left"),
-                (self.turned_deg[1], "upwards" if self.turned_deg[1] > 0 else "downwards"),
-            )
+            f"turned {abs(angle):.0f} degrees {names[int(angle <= 0)]}"
+            for angle, names in zip((right, up), sides, strict=True)
             if abs(angle) >= 5
         ]
-        how = " and ".join(turned) if turned else "facing the head"
-        return f"{where}, {self.range_m:.1f} m away, {how}"
+        return f"{where}, {self.range_m:.1f} m away, {' and '.join(turned) or 'facing the head'}"
 
     def rover_from_board(self, head_in_rover: Rigid) -> Rigid:
         """Return the pose (board: x right, y down, z into it) there, by the head's at zero angles."""

@@ -105,7 +105,7 @@ class LinkReporter:
         by_hand = self.run["by_hand"]
         while by_hand and not self._stands.empty():
             self._stands.get()  # of a placement before
-        described = {**as_json(placement), "description": placement.words(), "needs_confirmation": by_hand}
+        described = {**as_json(placement), "description": str(placement), "needs_confirmation": by_hand}
         self.change(
             asked={"name": name, **described},
             placements=self.run["placements"] + 1,

@@ -219,11 +219,11 @@ class Terminal:
         from mastctl.bench.reporter import NoOperator
 
         if not self._by_hand:
-            self.say(f"placement {name}: the board {placement.words()}")
+            self.say(f"placement {name}: the board {placement}")
             return
         if not signals.may_read_stdin():
             raise NoOperator("no operator can place the board: the command runs in its terminal's background")
-        self.say(f"\nPlacement {name}: put the board {placement.words()}.")
+        self.say(f"\nPlacement {name}: put the board {placement}.")
         sys.stderr.write("It need not be exact. Enter when it stands still (Ctrl-C: later). ")
         sys.stderr.flush()
         if not sys.stdin.readline():

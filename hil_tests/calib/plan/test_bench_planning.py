@@ -185,7 +185,7 @@ def test_a_second_placement_is_requested_where_it_adds_more(rig: Rig) -> None:
 
 def test_a_placement_says_in_words_where_it_puts_the_board(rig: Rig) -> None:
     placement = Placement(1.5, 30.0, -10.0, (25.0, 0.0))
-    assert placement.words() == (
+    assert str(placement) == (
         "30 degrees right, 10 degrees below the head's height, 1.5 m away, turned 25 degrees to the right"
     )
     head = rig.mast.rover_from_head(0.0, 0.0)

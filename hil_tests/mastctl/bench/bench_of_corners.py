@@ -155,7 +155,7 @@ class SelfPlacing:
 
     def place(self, name: str, placement: Placement) -> None:
         """Put the board there."""
-        self.told.append(f"{name}: {placement.words()}")
+        self.told.append(f"{name}: {placement}")
         self.bench.stand(placement)
 
 
