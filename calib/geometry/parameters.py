@@ -141,10 +141,10 @@ def predict(model: CameraModel, points_m: FloatArray) -> Prediction:
     Points that have no pixel come out as not-a-number. Each number's values of all points lie side by side in
     memory, so that numpy's loops run along them.
     """
-    points, axes = np.asarray(points_m, dtype=np.float64), model.lens_axes
-    pixels, d_points, valid = model.projection.forward(points, model.C, axes, True)
+    points = np.asarray(points_m, dtype=np.float64)
     d = np.subtract(points.T, model.C[:, None], order="C")
     with np.errstate(all="ignore"):
+        pixels, d_points, valid = model.projection.forward(points, model.C, model.lens_axes, True)
         d_step = _step_rates(model, d, pixels, d_points)
     d_step[..., ~valid] = np.nan
     return Prediction(pixels.T, d_step.transpose(2, 0, 1), d_points.transpose(2, 0, 1), valid)

@@ -49,18 +49,18 @@ class Projection(ReadOnlyArrays):
         count = len(points)
         pixels, valid = np.empty((count, 2)), np.empty(count, dtype=bool)
         jacobian = np.empty((count if derivatives else 0, 2, 3))
-        for part in _chunks(count):
-            seen, rates, valid[part] = self.forward(points[part], center, axes, derivatives)
-            pixels[part] = seen.T
-            if derivatives:
-                jacobian[part] = rates.transpose(2, 0, 1)
+        with np.errstate(all="ignore"):
+            for part in _chunks(count):
+                seen, rates, valid[part] = self.forward(points[part], center, axes, derivatives)
+                pixels[part] = seen.T
+                if derivatives:
+                    jacobian[part] = rates.transpose(2, 0, 1)
         return pixels, jacobian, valid
 
-    @np.errstate(all="ignore")
     def forward(
         self, points: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool
     ) -> tuple[FloatArray, FloatArray, np.ndarray]:
-        """Return the same of all points at once, as arrays (2, n), (2, 3, n) and (n,)."""
+        """Return the same of all points at once, as arrays (2, n), (2, 3, n) and (n,); NumPy may warn."""
         k = self.pixel_from_slope
         local = axes @ np.subtract(points.T, center[:, None], order="C")
         bent = self.lens.bend(local, derivatives)
