@@ -14,7 +14,7 @@ from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, cell
 from mastctl.cli.service import steers
 
 if TYPE_CHECKING:
-    from mastctl.client.answers import FaultSet, MastChange
+    from mastctl.answers import FaultSet, MastChange
     from mastctl.http.tokens import TokenList
 
 GROUPS |= {

@@ -19,8 +19,8 @@ from mastctl.cli.options import option
 from mastctl.cli.output import WrongUse
 
 if TYPE_CHECKING:
+    from mastctl.answers import OperationTold, StepTold
     from mastctl.client import Client
-    from mastctl.client.answers import OperationTold, StepTold
     from mastctl.config import Listen
 
 URL = option("--url ADDRESS", "the daemon's address (default: that of the configuration)")

@@ -16,7 +16,7 @@ from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, check_fold
 
 if TYPE_CHECKING:
     from drivers.probes import ProbedHead
-    from mastctl.client.answers import Status
+    from mastctl.answers import Status
     from mastctl.rig.drawing import RigAnswers
     from mastctl.rig.plugged import Plugged
     from mastctl.rig.questions import Prompts

@@ -21,8 +21,7 @@ from mastctl.cli.output import Answer, CommandError, Shown, WrongUse
 from mastctl.logs import QueuedHandler
 
 if TYPE_CHECKING:
-    from mastctl.client import Client
-    from mastctl.client.answers import (
+    from mastctl.answers import (
         ControlTold,
         Event,
         LeaseGranted,
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
         Status,
         TrackTold,
     )
+    from mastctl.client import Client
     from mastctl.config import Config, Listen
 
 POLL_S = 0.1  # how often `status --wait` requests the status

@@ -13,8 +13,8 @@ from mastctl.cli.output import Answer, CommandError, WrongUse
 from mastctl.cli.service import pointings_shown, show_each, track_line
 
 if TYPE_CHECKING:
+    from mastctl.answers import OperationTold, TrackTold
     from mastctl.client import Client
-    from mastctl.client.answers import OperationTold, TrackTold
 
 POLL_S = 0.05  # how often it is checked that the daemon still takes the heartbeats
 

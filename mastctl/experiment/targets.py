@@ -22,8 +22,8 @@ from calib.geometry.stereo import triangulate
 from calib.matching.partner import find_partner
 from calib.matching.warp import PosedImage, grey
 from drivers.interfaces import Image
+from mastctl.answers import OperationTold
 from mastctl.client import Client, ClientError, Snapshot
-from mastctl.client.answers import OperationTold
 
 BORDER_PX = 64  # nearer the edge than this a person would turn the head first
 TRIES_PER_VIEW = 8
