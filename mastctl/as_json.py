@@ -42,25 +42,12 @@ TOO_DEEP = "nested too deeply to be shown"
 
 
 def writable(value: Any) -> Any:
-    """Return a value as JSON holds it: itself if it does, else with text in the place of what it does not.
-
-    A number that is not finite becomes ``inf``, ``-inf`` or ``nan``, an object that is no JSON its text.
-    """
+    """Return a value as JSON holds it: itself if it does, else as `as_json` has it."""
     try:
         json.dumps(value, allow_nan=False)
     except (TypeError, ValueError, RecursionError):
         try:
-            return _worded(value)
+            return as_json(value)
         except RecursionError:
             return TOO_DEEP
     return value
-
-
-def _worded(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _worded(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_worded(entry) for entry in value]
-    if value is None or isinstance(value, (str, int)) or (isinstance(value, float) and math.isfinite(value)):
-        return value
-    return str(value)

@@ -22,7 +22,7 @@ from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 
 from calib.files.atomic import sync_folder
-from mastctl.as_json import as_json
+from mastctl.as_json import writable
 from mastctl.recorder.schemas import encodings
 
 FINISH_S = 3.0
@@ -126,10 +126,7 @@ class RecordFile:
 
     def add_json(self, topic: str, kind: str, record: Mapping[str, Any], time_s: float) -> None:
         """Add one JSON message; ``kind`` names its schema."""
-        try:
-            text = json.dumps(record, allow_nan=False, separators=(",", ":"))
-        except (TypeError, ValueError):
-            text = json.dumps(as_json(record), separators=(",", ":"))
+        text = json.dumps(writable(record), separators=(",", ":"))
         self._add(topic, f"mastctl.{kind}", text.encode(), time_s)
 
     def add_message(self, topic: str, message: Message, time_s: float) -> None:
