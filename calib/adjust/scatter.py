@@ -136,18 +136,16 @@ def print_error_m(problem: Adjustment, state: Estimate) -> float:
 
     It is the same in all pictures, where noise is another in each; 0 where chance makes them agree as much.
     """
-    sums: dict[tuple[str, int], tuple[FloatArray, FloatArray]] = {}
     shown = [t for t in problem.images if t.keep.any() and t.ids is not None and t.board not in problem.fixed]
+    sums: dict[tuple[str, int], FloatArray] = {}
     for term, block in zip(shown, problem.blocks_of(state, shown), strict=True):
         axes = state.rover_from_board[term.board].rotation[:, :2]
         by_place = block.rates(("board", term.board))[:, 3:].reshape(-1, 2, 3) @ axes
-        off = block.residual.reshape(-1, 2)
+        rows = np.concatenate([by_place, block.residual.reshape(-1, 2, 1)], axis=2)
         assert term.ids is not None
-        for corner, rates, residual in zip(term.ids[term.keep].tolist(), by_place, off, strict=True):
-            key = (term.board[0], corner)
-            matrix, pull = sums.get(key, (np.zeros((2, 2)), np.zeros(2)))
-            sums[key] = matrix + rates.T @ rates, pull + rates.T @ residual
-    known = [(matrix, pull) for matrix, pull in sums.values() if np.linalg.det(matrix) > 0.0]
+        for corner, one in zip(term.ids[term.keep].tolist(), rows.transpose(0, 2, 1) @ rows, strict=True):
+            sums[term.board[0], corner] = sums.get((term.board[0], corner), 0.0) + one
+    known = [(one[:2, :2], one[:2, 2]) for one in sums.values() if np.linalg.det(one[:2, :2]) > 0.0]
     agree = sum(float(pull @ np.linalg.solve(matrix, pull)) for matrix, pull in known)
     if not known or chdtrc(2 * len(known), agree) >= Level.STATED:
         return 0.0

@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from calib.adjust.adjustment import Adjustment
 from calib.adjust.outliers import Outlier
@@ -97,23 +98,21 @@ def two_step_covariance(
     rates = references.rates(problem, state)
     first, second = rates.T @ first @ rates, rates.T @ second @ rates
     k, m = problem.unknowns.of_kinds("camera"), problem.at(MAST)
-    s = np.setdiff1d(np.arange(total), np.concatenate([k, m]))
-    by_dots_k = covariance_of(first[np.ix_(k, k)], problem.weak[k])
-    k_by_s = -by_dots_k @ first[np.ix_(k, s)]
-    by_dots_m = covariance_of(second[np.ix_(m, m)], problem.weak[m]) if len(m) else np.zeros((0, 0))
-    m_by_k = -by_dots_m @ second[np.ix_(m, k)]
-    m_by_s = -by_dots_m @ second[np.ix_(m, s)] + m_by_k @ k_by_s
-    follow = np.concatenate([np.eye(len(k)), m_by_k])
-    dots = follow @ by_dots_k @ follow.T
-    dots[len(k) :, len(k) :] += by_dots_m
-    by_s = np.concatenate([k_by_s, m_by_s])
+    rig, size = np.concatenate([k, m]), len(k)
+    s = np.setdiff1d(np.arange(total), rig)
+    steps = np.zeros((len(rig), len(rig)))
+    steps[:size, :size], steps[size:] = first[np.ix_(k, k)], second[np.ix_(m, rig)]
+    steps += np.diag(problem.weak[rig])
+    scale = 1.0 / np.sqrt(np.diag(steps))
+    inverse = np.linalg.inv(steps * np.outer(scale, scale)) * np.outer(scale, scale)
+    dots = inverse @ block_diag(steps[:size, :size], steps[size:, size:]) @ inverse.T
+    by_s = -inverse @ np.concatenate([first[np.ix_(k, s)], second[np.ix_(m, s)]])
     of_station = covariance_of(station[np.ix_(s, s)])
-    rig, errors = np.concatenate([k, m]), np.zeros((total, total))
+    errors, alone = np.zeros((total, total)), np.zeros((total, total))
     errors[np.ix_(rig, rig)] = dots + by_s @ of_station @ by_s.T
     errors[np.ix_(rig, s)] = by_s @ of_station
     errors[np.ix_(s, rig)] = errors[np.ix_(rig, s)].T
     errors[np.ix_(s, s)] = of_station
-    alone = np.zeros((total, total))
     alone[np.ix_(rig, rig)] = dots
     return rates @ errors @ rates.T, rates @ alone @ rates.T
 

@@ -81,7 +81,7 @@ def test_the_covariance_is_that_of_the_errors_that_happened(navcams: Rig, happen
     assert np.abs(fit.estimate[:n] - honest.estimate[:n]).max() < 1e-3
 
 
-def test_a_sigma_that_is_too_large_is_told_and_harms_nothing(navcams: Rig) -> None:
+def test_a_sigma_that_is_too_large_is_reported_and_harms_nothing(navcams: Rig) -> None:
     stated = Sigma(station_m=0.003, dot_px=0.3, joint_rad=3e-4)
     survey = replace(survey_of(navcams, 4, sigma=STATED), sigma=stated)
     fit = fit_joint(survey)

@@ -223,9 +223,7 @@ def test_stated_pointing_uncertainty_is_that_of_the_fit_alone(joint: Calibration
         (("mast",), "; take more images of purpose mast, spread over pan and tilt"),
     ],
 )
-def test_what_is_open_though_the_head_moved_is_told_with_what_would_fix_it(
-    owner: tuple[str, ...], advice: str
-) -> None:
+def test_an_open_direction_is_named_with_what_would_fix_it(owner: tuple[str, ...], advice: str) -> None:
     def image(camera: str, board: str, angle_rad: float, used: bool = True) -> Any:
         angles = {"pan_rad": angle_rad, "tilt_rad": angle_rad}
         return SimpleNamespace(camera=camera, board=board, attitude=0, keep=np.array([used]), **angles)

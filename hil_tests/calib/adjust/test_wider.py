@@ -114,7 +114,7 @@ def test_skew_axes_fitted_with_six_parameters_ask_for_eight(navcams: Rig) -> Non
     assert asked(eight) == []
 
 
-def test_prisms_that_stand_elsewhere_than_drawn_are_told(navcams: Rig) -> None:
+def test_prisms_that_stand_elsewhere_than_drawn_are_reported(navcams: Rig) -> None:
     """Off by 3 mm an axis, and told to be exact."""
     survey = simulate_survey(navcams, 5, replace(PLAN, sigma=Sigma(0.001, 0.1, 0.0, 0.003)))[0]
     fit = fit_joint(replace(survey, sigma=Sigma(0.001, 0.1)))
@@ -174,9 +174,7 @@ MORE_DRAWS = pytest.mark.long(2, "more draws of the same; one is in the quick ru
 
 
 @pytest.mark.parametrize("seed", [7, *(pytest.param(seed, marks=MORE_DRAWS) for seed in (8, 9))])
-def test_a_board_read_at_other_angles_is_told_by_itself_or_by_what_is_left_out(
-    navcams: Rig, seed: int
-) -> None:
+def test_a_board_read_at_other_angles_is_named_or_left_out(navcams: Rig, seed: int) -> None:
     """By which of the two depends on the draws: an attitude 3 mrad off is 10 to 30 sigmas of three tapes."""
     survey = simulate_survey(navcams, seed, SurveyPlan(mast_boards=12))[0]
     shown = of_placement(survey, "mast-3")

@@ -286,7 +286,7 @@ def test_a_drift_of_many_numbers_has_to_explain_more_than_a_change_of_few() -> N
     assert not found(3000.0, 4).likelier(found(3100.0, 1))
 
 
-def test_a_camera_without_a_picture_left_is_asked_for_no_drift() -> None:
+def test_a_camera_without_a_picture_left_is_tested_for_no_drift() -> None:
     plan = BenchPlan(attitudes=8, checks=0)
     bench = BenchProblem(simulate_bench(1, replace(plan, placements=plan.placements[:2])), BenchOptions())
     problem = bench.problem({}, bench.start).without_unseen(bench.start)

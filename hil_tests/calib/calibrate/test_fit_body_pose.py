@@ -238,7 +238,7 @@ def test_targets_at_one_range_leave_directions_to_the_prior_by_name(rig: Rig) ->
     assert (sigma <= np.array([PRIOR_TURN_RAD] * 3 + [PRIOR_SHIFT_M] * 3)).all()
 
 
-def test_an_eye_that_moved_by_itself_is_told(rig: Rig) -> None:
+def test_a_camera_that_moved_by_itself_is_reported(rig: Rig) -> None:
     rng = np.random.default_rng(6)
     made = hand_offs({n: vectors(rig, n) for n in HAZCAMS}, rig, targets(rng, 24), rng)
     apart = fit_body_pose(rig, HAZCAMS, made).cameras_apart

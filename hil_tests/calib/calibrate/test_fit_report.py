@@ -77,7 +77,7 @@ def test_sigmas_of_the_mast_file_are_the_roots_of_the_covariance(fitted: Calibra
             assert camera[letter] == pytest.approx(wanted)
 
 
-def test_fitted_images_are_told_at_the_angles_as_fitted_and_checks_as_read(navcams: Rig) -> None:
+def test_fitted_images_have_the_angles_as_fitted_and_checks_as_read(navcams: Rig) -> None:
     """Joints that are 2 mrad off move a Navcam's dots by some 2.5 px."""
     fit = fit_joint(survey_of(navcams, 22, SMALL, rings=rings(4), sigma=Sigma(0.001, 0.1, joint_rad=0.002)))
     head = [i for i in fit.images if i.used.any()]
@@ -92,7 +92,7 @@ def test_where_everything_is_twice_as_noisy_as_stated_nothing_is_an_outlier(navc
     assert fit.outliers == ()
 
 
-def test_the_papers_fit_tells_how_far_an_image_was_off_that_it_left_out(navcams: Rig) -> None:
+def test_the_papers_fit_states_how_far_off_a_left_out_image_was(navcams: Rig) -> None:
     survey = survey_of(navcams, 24, SMALL)
     name = next(i.name for i in survey.images if i.purpose == "mast")
     (outlier,) = fit_paper(with_shifted_dots(survey, name, (30.0, 0.0))).outliers
