@@ -22,7 +22,7 @@ import numpy as np
 
 from calib.adjust.adjustment import Adjustment
 from calib.adjust.goodness import goodness
-from calib.adjust.solver import Minimum, covariance_of
+from calib.adjust.solver import Minimum
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
 from calib.geometry.rig import AXIS_NAMES, JOINTS_NAMES, MAST_NAMES
@@ -156,8 +156,7 @@ def choose_terms(
     problem: Adjustment, fit: Minimum[Estimate], terms: Mapping[str, ModelTerm]
 ) -> tuple[dict[str, ModelTerm], dict[str, TermGain]]:
     """Return which of the terms that were fitted are needed, and how each one does beside these."""
-    covariance = covariance_of(fit.normal.matrix, problem.weak)
-    total, freedom = goodness(problem, fit.state, covariance)
+    total, freedom = goodness(problem, fit.state, fit.covariance)
     freedom = max(freedom, 1.0)
     scale = total / freedom
     values = problem.values(fit.state, "joints", "mast", "bow")
@@ -166,7 +165,7 @@ def choose_terms(
         places[name] = list(range(len(numbers), len(numbers) + len(term.parameters)))
         numbers += term.parameters
     at = [problem.names.index(number) for number in numbers]
-    x, c = np.array([values[number] for number in numbers]), covariance[np.ix_(at, at)]
+    x, c = np.array([values[number] for number in numbers]), fit.covariance[np.ix_(at, at)]
     motion = _motion(problem, fit.state, terms, places, at)
 
     def is_play(group: Sequence[str]) -> bool:

@@ -21,12 +21,11 @@ from calib.adjust.goodness import Component, found_sigmas, goodness, variance_co
 from calib.adjust.hypotheses import ScoredFit, find_contradictions
 from calib.adjust.outliers import judge, name_outliers
 from calib.adjust.scatter import own_scales, with_scales
-from calib.adjust.solver import Minimum, covariance_of, minimise
+from calib.adjust.solver import Minimum, minimise
 from calib.adjust.terms import ImageTerm, StationTerm, scattered_images, widened_images
 from calib.adjust.uncertainty import fitted_fields, image_residuals, open_directions
 from calib.adjust.unknowns import Estimate
 from calib.errors import CalibError
-from calib.geometry.rigid import FloatArray
 from calib.geometry.significance import Level, typical_scale
 from calib.survey.records import Survey
 
@@ -78,7 +77,6 @@ class Weighed:
 
     problem: Adjustment
     fit: Minimum[Estimate]
-    covariance: FloatArray
     images: tuple[ImageTerm, ...]
     components: tuple[Component, ...]
     excess: float
@@ -110,14 +108,14 @@ def weighed_fields(
     Chi-square is that of the fit by the stated sigmas. ``images`` are all with every dot, and ``checks``
     the check images, with stated sigmas; the rest is as of `calib.adjust.uncertainty.fitted_fields`.
     """
-    problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
+    problem, state, covariance = weighed.problem, weighed.fit.state, weighed.fit.covariance
     order_px = survey.sigma.corner_px if survey.boards else survey.sigma.dot_px
     own = own_scales(problem, state, checks, weighed.factors, order_px)
     sized = widened_images(scattered_images(checks, own), weighed.factors)
     scatter = {t.name: t.scatter for t in (*weighed.images, *sized)}
     residuals = image_residuals(survey, problem, state, images, checks, scatter)
     stated, fit = cleaned.as_stated()
-    chi2, freedom = goodness(stated, fit.state, covariance_of(fit.normal.matrix, stated.weak))
+    chi2, freedom = goodness(stated, fit.state, fit.covariance)
     return {
         **fitted_fields(survey, problem, state, covariance, residuals, sized, kinds, level, notes, widened),
         "chi2": chi2,
@@ -144,8 +142,7 @@ def weigh(cleaned: Cleaned, *, narrows: bool = True) -> Weighed:
     weighed = dict(cleaned.cameras)
     first: tuple[Component, ...] = ()
     for count in range(WEIGHINGS + 1):
-        covariance = covariance_of(fit.normal.matrix, problem.weak)
-        components = variance_components(problem.blocks(fit.state), covariance, weighed)
+        components = variance_components(problem.blocks(fit.state), fit.covariance, weighed)
         first = first or components
         wanted = found_sigmas(components, narrows=narrows)
         change = {kind: factor / weighed.get(kind, 1.0) for kind, factor in wanted.items()}
@@ -161,7 +158,7 @@ def weigh(cleaned: Cleaned, *, narrows: bool = True) -> Weighed:
         )
     wrong = {c.kind for c in components if c.wrong}
     excess = sum(((c.factor / c.weighed) ** 2 - 1) * c.redundancy for c in first if c.kind in wrong)
-    return Weighed(problem, fit, covariance, tuple(images), components, excess)
+    return Weighed(problem, fit, tuple(images), components, excess)
 
 
 def without_blunders(
@@ -198,8 +195,7 @@ def judged(
     _refuse_lost(fit)
     kept = {_kept(problem.images, problem.station)}
     for _ in range(ROUNDS):
-        covariance = covariance_of(fit.normal.matrix, problem.weak)
-        seen, station = judge(problem, fit.state, covariance, images)
+        seen, station = judge(problem, fit.state, fit.covariance, images)
         pattern = _kept(seen, station)
         if pattern in kept:  # nothing new, or a measurement on its limit that comes and goes
             break

@@ -7,6 +7,7 @@ its weighted residuals at a state. Columns are scaled to one, so that metres, ra
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -53,12 +54,19 @@ class LeastSquaresProblem(Protocol[State]):
 
 @dataclass(frozen=True, eq=False)
 class Minimum(Generic[State]):
-    """Where a fit ended: its state, the normal equations there, and whether it settled within its steps."""
+    """Where a fit ended: its state, the normal equations there, whether it settled within its steps, and what
+    was added to their diagonal."""
 
     state: State
     normal: Normal
     settled: bool
     steps: int
+    weak: FloatArray
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """(p, p) of the unknowns; one that the data leave open keeps the variance 1 / ``weak``."""
+        return covariance_of(self.normal.matrix, self.weak)
 
 
 def minimise(
@@ -102,7 +110,7 @@ def minimise(
             if nothing_left:
                 if moved is not None:
                     state, normal = moved, problem.normal(moved)
-                return Minimum(state, normal, True, count)
+                return Minimum(state, normal, True, count, extra)
             if moved is None:
                 damping = max(10 * damping, 1e-12)
             elif normal.cost - cost < POOR * expected:
@@ -111,12 +119,12 @@ def minimise(
                 damping = damping / 10
         if moved is None:
             # No step of any size lowers the cost any more: rounding, or a place where it has a kink.
-            return Minimum(state, normal, _as_good(expected, normal), count)
+            return Minimum(state, normal, _as_good(expected, normal), count, extra)
         before, state, normal = normal, moved, problem.normal(moved)
         if normal.cost >= before.cost and _as_good(expected, before):
             # The trial's cost was lower by rounding alone, and would be again and again.
-            return Minimum(state, normal, True, count)
-    return Minimum(state, normal, False, steps)
+            return Minimum(state, normal, True, count, extra)
+    return Minimum(state, normal, False, steps, extra)
 
 
 def _as_good(expected: float, normal: Normal) -> bool:

@@ -128,7 +128,7 @@ def _calibration(
     began: float,
 ) -> Calibration:
     """Put together what the fit says, with the stated sigmas and with those that were found."""
-    problem, state, covariance = weighed.problem, weighed.fit.state, weighed.covariance
+    problem, state, covariance = weighed.problem, weighed.fit.state, weighed.fit.covariance
     notes, widened = list(start.notes), 1.0
     chi_square, freedom = goodness(problem, state, covariance)
     if freedom > 0 and chdtrc(freedom, chi_square) < Level.STATED:

@@ -19,7 +19,6 @@ from calib.adjust.adjustment import Adjustment
 from calib.adjust.gross import chance_limit
 from calib.adjust.outliers import Outlier, name_outliers
 from calib.adjust.robust import judged
-from calib.adjust.solver import covariance_of
 from calib.adjust.terms import station_terms
 from calib.adjust.unknowns import Estimate
 from calib.geometry.rigid import FloatArray, Rigid
@@ -117,7 +116,7 @@ def _together(
             "the drawing; check the prisms' names and places"
         )
     prisms = dict(fit.state.prisms_in_rover_m)
-    blunders = list(name_outliers(problem, fit.state, covariance_of(fit.normal.matrix, problem.weak), ()))
+    blunders = list(name_outliers(problem, fit.state, fit.covariance, ()))
     for name in sorted(misdrawn):
         off_m = prisms[name] - survey.prisms_in_rover_m[name]
         blunders.append(_outlier("prism", name, "in the drawing", off_m, survey.sigma.prism_cad_m))
