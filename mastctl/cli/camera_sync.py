@@ -160,7 +160,7 @@ def _notes(found: dict[str, Any]) -> list[str]:
 
 def _shown(document: dict[str, Any]) -> Iterator[str | Shown]:
     """What a person needs of each camera, the line for the configuration, and the notes."""
-    keys = ("left_s", "sigma_s", "in_use_s", "frames", "used_frames", "rolling_s", "play_rad")
+    keys = ("left_s", "sigma_s", "frames", "rolling_s", "play_rad")
     rows = [
         {"camera": name, **{key: found.get(key) for key in keys}}
         for name, found in document["cameras"].items()

@@ -163,7 +163,7 @@ def print_table(
     rows = list(rows)
     table = Table(title=Text(title), title_justify="left", show_header=any(columns))
     for column, numeric in zip(columns, tables.Table(columns, rows).numeric, strict=True):
-        table.add_column(Text(column), justify="right" if numeric else "left")
+        table.add_column(Text(column), justify="right" if numeric else "left", overflow="fold")
     for row in rows:
         table.add_row(*(Text(one) for one in row))
     console = Console(file=sys.stdout, soft_wrap=True)
