@@ -27,7 +27,6 @@ SHIFT_NOTE_PX = 0.01
 #: No component of a camera model or a mast is larger; beyond it the arithmetic would overflow.
 LARGEST_COMPONENT = 1e9
 LARGEST_IMAGE_PX = 65536
-BLIND_GRID = (38, 31)
 #: A lens with no ray in more than this part of its image is refused; a fisheye's corners often have none.
 MOST_BLIND = 0.5
 JPEG_SCAN = 0xDA
@@ -191,9 +190,7 @@ def build_model(
 
 def blind_part(model: CameraModel) -> float:
     """Return the part of the image, to its outer border, that has no ray."""
-    x, y = (
-        np.linspace(-0.5, size - 0.5, count) for size, count in zip(model.size_px, BLIND_GRID, strict=True)
-    )
+    x, y = (np.linspace(-0.5, size - 0.5, count) for size, count in zip(model.size_px, (38, 31), strict=True))
     return float(1.0 - model.ray(np.stack(np.meshgrid(x, y), axis=-1)).valid.mean())
 
 

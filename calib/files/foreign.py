@@ -57,8 +57,6 @@ _SPREAD_KEY = re.compile(r"std|dev|sigma|cov|err", re.I)
 _NEAR = 0.85
 """How alike (difflib's ratio) a key that is not read and a known one must be for a misspelling."""
 
-_LARGEST_COEFFICIENT, _FOCAL_PX = 1e6, (1e-3, 1e7)
-
 
 def _flat(value: Any) -> Any:
     """The numbers of ``{rows, cols, data}``, of a list of rows, or of a list; the data count."""
@@ -227,11 +225,10 @@ def lens_camera(
 
     One without a lens is a CAHV. Raises BadFile if the numbers are no camera, or as `blind_notes`.
     """
-    if np.abs(distortion).max(initial=0.0) > _LARGEST_COEFFICIENT:
+    if np.abs(distortion).max(initial=0.0) > 1e6:
         raise source.bad("", f"coefficients {distortion.tolist()} where numbers up to 1e6 are expected")
     focal_px, pose = matrix[[0, 1], [0, 1]], frame_from_camera
-    low, high = _FOCAL_PX
-    if not ((np.abs(focal_px) > low) & (np.abs(focal_px) < high)).all() or np.abs(matrix[:2, 2]).max() > high:
+    if not ((np.abs(focal_px) > 1e-3) & (np.abs(focal_px) < 1e7)).all() or np.abs(matrix[:2, 2]).max() > 1e7:
         raise source.bad("", f"focal length {focal_px.tolist()} where pixels are expected")
     if focal_px.prod() < 0.0:
         raise source.bad("", f"focal lengths {focal_px.tolist()} of two signs: a mirrored image is not read")

@@ -22,32 +22,17 @@ from calib.geometry.cahvor import COEFFICIENTS, FREE, CameraModel, Kind
 from calib.geometry.parameters import parameter_part, predict
 from calib.geometry.rigid import FloatArray, tangents
 
-FIT_GRID = (25, 19)
-"""Columns and rows of the pixels that a twin is fitted at, from corner to corner of the image."""
-
-CHECK_GRID = (38, 31)
-"""Columns and rows of those that it is measured at; but for the corners none is among the others."""
-
 RANGES_M = (1.0, 100.0)
 """Where points stand along a ray: at both if the entrance point moves, at the second if it does not."""
-
-EXACT_PX = 1e-6
-"""Nearer than this a twin is called exact."""
 
 GOOD_PX = 0.005
 """A twin this near is looked for no further."""
 
 _COEFFICIENT_PX = 1e-3
-"""What a coefficient of 1 costs in a fit: nothing, except where the pixels do not tell it."""
+"""What a coefficient of 1 costs in a fit: nothing, except where the pixels do not determine it."""
 
-_STEPS, _BIT, _NO_STEP_PX = 400, 1e-6, 1e-9
-"""How many cameras a fit may try; a step of numeric derivatives; a start this near is the answer."""
-
-_LOST_PX = 1e3
-"""The residual of a point that the camera of a fit does not see."""
-
-_SQUARE = 1e-12
-"""Skew below this part of the focal length is none."""
+_BIT = 1e-6
+"""A step of numeric derivatives."""
 
 
 LensFamily = Literal["pinhole", "equidistant"]
@@ -72,7 +57,7 @@ def as_kind(model: CameraModel, kind: Kind) -> CameraModel | None:
     """
     if (
         model.kind not in (*COEFFICIENTS, "CAHV")
-        or abs(model.camera_matrix[0, 1]) > _SQUARE * model.focal_px[0]
+        or abs(model.camera_matrix[0, 1]) > 1e-12 * model.focal_px[0]
     ):
         return None
     if (model.kind == FISHEYE) != (kind == FISHEYE):
@@ -105,7 +90,7 @@ class TwinError:
 
 def error_sentence(error: TwinError) -> str:
     """Return how far a twin is, as a part of a sentence."""
-    if error.worst_px < EXACT_PX:
+    if error.worst_px < 1e-6:
         return "exact"
     x, y = error.worst_at_px
     return f"{error.worst_px:.2g} px off at worst (at pixel {x:.0f}, {y:.0f}), {error.rms_px:.2g} px rms"
@@ -126,7 +111,7 @@ def twin_error(camera: CameraModel, twin: CameraModel, near: bool = False) -> Tw
 
     With ``near`` points 1 m away count too: they do where an entrance point moves.
     """
-    pixels = grid_px(camera.size_px, CHECK_GRID, 0.5)
+    pixels = grid_px(camera.size_px, (38, 31), 0.5)  # but for the corners none of those of a fit
     far, blind = [], 0.0
     for one, other in ((camera, twin), (twin, camera)):
         rays = one.ray(pixels)
@@ -309,7 +294,7 @@ def _fit(
     whole = bool(start.ray(corners).valid.all())
 
     def off(unknowns: FloatArray) -> FloatArray:
-        far = np.full(pixels.shape, _LOST_PX)
+        far = np.full(pixels.shape, 1e3)
         with contextlib.suppress(ValueError):  # no camera
             camera = camera_of(unknowns)
             if not whole or camera.ray(corners).valid.all():  # a lens may fold there, and no point shows it
@@ -334,14 +319,14 @@ def _fit(
         costs = _COEFFICIENT_PX * np.eye(len(unknowns))[ends[-1] :] * (start.kind in FREE)
         return np.vstack([found, costs])
 
-    if np.abs(off(begin)[: pixels.size]).max() < _NO_STEP_PX:
+    if np.abs(off(begin)[: pixels.size]).max() < 1e-9:
         return start
-    return camera_of(least_squares(off, begin, rates, method="lm", x_scale=1.0, max_nfev=_STEPS).x)
+    return camera_of(least_squares(off, begin, rates, method="lm", x_scale=1.0, max_nfev=400).x)
 
 
 def _points_of(camera: CameraModel) -> tuple[FloatArray, FloatArray]:
     """Pixels (n, 2) over the image and points (n, 3) seen there, near ones too where that matters."""
-    pixels = grid_px(camera.size_px, FIT_GRID, 0.5)
+    pixels = grid_px(camera.size_px, (25, 19), 0.5)
     rays = camera.ray(pixels)
     if np.count_nonzero(rays.valid) < len(pixels) // 2:
         raise ValueError("more than half of the image has no ray that such a camera can have")
