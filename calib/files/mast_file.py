@@ -47,13 +47,10 @@ _TurnRow = Annotated[list[_Turn], Field(min_length=3, max_length=3)]
 _Coefficient = Annotated[float, Field(ge=-1e6, le=1e6)]
 
 
-def _refuse_name(what: str) -> AfterValidator:
-    def check(name: str) -> str:
-        if not _NAME.fullmatch(name):
-            raise problem("", f"a {what}'s name is letters, digits, '_' and '-'")
-        return name
-
-    return AfterValidator(check)
+def _named(name: str) -> str:
+    if not _NAME.fullmatch(name):
+        raise problem("", "a camera's or pair's name is letters, digits, '_' and '-'")
+    return name
 
 
 def _pair(names: object) -> object:
@@ -66,9 +63,8 @@ def _pair(names: object) -> object:
 
 
 _NAMED = WithJsonSchema({"type": "string", "pattern": f"^{_NAME.pattern}$"})
-CameraName = Annotated[str, _refuse_name("camera"), _NAMED]
-"""``<pair>_left`` and ``<pair>_right`` for the cameras of a pair; a single camera has no side."""
-_PairName = Annotated[str, _refuse_name("pair"), _NAMED]
+CameraName = Annotated[str, AfterValidator(_named), _NAMED]
+"""``<pair>_left`` and ``<pair>_right`` for the cameras of a pair; a pair, or a single camera, has no side."""
 _SIDES = [{"type": "string", "pattern": "_left$"}, {"type": "string", "pattern": "_right$"}]
 _Pair = Annotated[
     Any,
@@ -235,7 +231,7 @@ class JointsRecord(Record):
 class StereoRecord(Record):
     """The key ``stereo`` of a file, which names cameras of the key ``cameras`` of a class that adds it."""
 
-    stereo: dict[_PairName, _Pair] = Field(default={}, description="the cameras of each pair")
+    stereo: dict[CameraName, _Pair] = Field(default={}, description="the cameras of each pair")
 
     @property
     def pairs(self) -> dict[str, tuple[str, str]]:
