@@ -36,7 +36,6 @@ MAST_SCHEMA = "mastctl/mast/1"
 CAMERA_SCHEMA = "mastctl/camera/1"
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*")
-_ROUNDED, _NO_ROTATION = 1e-15, 1e-3
 
 _Size = Annotated[int, Field(ge=1, le=LARGEST_IMAGE_PX)]
 SizePx = Annotated[list[_Size], Field(min_length=2, max_length=2)]
@@ -382,11 +381,11 @@ def _opencv_model(
 
     matrix, given = np.array(record.camera_matrix), np.array(record.rotation)
     rotation, notes = given, tuple[str, ...]()
-    if np.abs(given @ given.T - np.eye(3)).max() > _ROUNDED:
+    if np.abs(given @ given.T - np.eye(3)).max() > 1e-15:
         turn, _, other = np.linalg.svd(given)
         rotation = turn @ other
     off = float(np.abs(rotation - given).max())
-    if not off < _NO_ROTATION or np.linalg.det(rotation) < 0.0:
+    if not off < 1e-3 or np.linalg.det(rotation) < 0.0:
         raise BadFile(path, at("rotation"), f"{given.tolist()} where a rotation is expected")
     try:
         model = CameraModel.of_matrix(record.model, size_px, matrix, record.distortion, rotation, record.C)
