@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import isfinite
 
 import numpy as np
 
@@ -51,40 +52,42 @@ class Projection(ReadOnlyArrays):
         jacobian = np.empty((count if derivatives else 0, 2, 3))
         with np.errstate(all="ignore"):
             for part in _chunks(count):
-                seen, rates, valid[part] = self.forward(points[part], center, axes, derivatives)
-                pixels[part] = seen.T
-                if derivatives:
-                    jacobian[part] = rates.transpose(2, 0, 1)
+                rates = jacobian[part].transpose(1, 2, 0)
+                self.forward(points[part], center, axes, pixels[part].T, rates, valid[part])
         return pixels, jacobian, valid
 
     def forward(
-        self, points: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool
-    ) -> tuple[FloatArray, FloatArray, np.ndarray]:
-        """Return the same of all points at once, as arrays (2, n), (2, 3, n) and (n,); NumPy may warn."""
+        self,
+        points: FloatArray,
+        center: FloatArray,
+        axes: FloatArray,
+        pixels: FloatArray,
+        jacobian: FloatArray,
+        valid: np.ndarray,
+    ) -> None:
+        """Fill pixels (2, n), the Jacobian (2, 3, n) if not empty, and validity (n,); NumPy may warn."""
         k = self.pixel_from_slope
         local = axes @ np.subtract(points.T, center[:, None], order="C")
-        bent = self.lens.bend(local, derivatives)
+        bent = self.lens.bend(local, jacobian.size > 0)
         seen = k[:, :2] @ bent.slopes
         seen += k[:, 2:]
-        valid = bent.valid & (seen[2] > 0.0)
-        if not self.lens.curved:
-            valid &= k[2] @ local > 0.0
-        per_depth = 1.0 / seen[2]
-        pixels = seen[:2] * per_depth
-        valid &= np.isfinite(pixels).all(axis=0)
-        jacobian = np.empty((2, 3, 0))
+        depth = seen[2]
+        np.greater(depth if self.lens.curved else np.minimum(depth, k[2] @ local), 0.0, out=valid)
+        valid &= bent.valid
+        per_depth = np.divide(1.0, depth, out=depth)
+        np.multiply(seen[:2], per_depth, out=pixels)
+        if not isfinite(np.vdot(pixels.T, pixels.T)):
+            valid &= np.isfinite(pixels).all(axis=0)
         if bent.rates is not None:
             # Of the plane's three rows by the point, turned by the axes: one product of matrices.
             turned = np.einsum("is,jl->ijsl", k[:, :2], axes.T).reshape(9, 6)
             rows = (turned @ bent.rates.reshape(6, -1)).reshape(3, 3, -1)
             if k[2, :2].any():
                 rows[:2] -= pixels[:, None] * rows[2]
-            jacobian = rows[:2]
-            jacobian *= per_depth
+            np.multiply(rows[:2], per_depth, out=jacobian)
         if not valid.all():
             pixels[:, ~valid] = np.nan
             jacobian[..., ~valid[: jacobian.shape[2]]] = np.nan
-        return pixels, jacobian, valid
 
     def rays(
         self, pixels: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool

@@ -84,16 +84,20 @@ class OpencvLens:
     def _radial(self, tau: FloatArray) -> tuple[FloatArray, FloatArray]:
         """r, and what r is divided by."""
         k1, k2, _, _, k3, k4, k5, k6, *_ = self._numbers
+        above = 1.0 + tau * (k1 + tau * (k2 + tau * k3))
+        if not (k4 or k5 or k6):
+            return above, np.ones_like(tau)
         below = 1.0 + tau * (k4 + tau * (k5 + tau * k6))
-        return (1.0 + tau * (k1 + tau * (k2 + tau * k3))) / below, below
+        return above / below, below
 
     def _flat(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, ...]:
         """u and v before the plane is turned, tau, then du/dx, du/dy, dv/dx, dv/dy."""
         k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = self._numbers
         tau = x * x + y * y
-        r, below = self._radial(tau)
         rate = 2.0 * k1 + tau * (4.0 * k2 + tau * (6.0 * k3))
-        rate = (rate - r * (2.0 * k4 + tau * (4.0 * k5 + tau * (6.0 * k6)))) / below
+        r, below = self._radial(tau)
+        if k4 or k5 or k6:
+            rate = (rate - r * (2.0 * k4 + tau * (4.0 * k5 + tau * (6.0 * k6)))) / below
         g = r + (2.0 * p1) * y + (2.0 * p2) * x
         gx, gy = x * rate + 2.0 * p2, y * rate + 2.0 * p1  # rate is 2 dr / d tau
         h, j = (p2 + s1) + s2 * tau, (p1 + s3) + s4 * tau
