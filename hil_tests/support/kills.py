@@ -101,7 +101,7 @@ def judged(folder: Path, mast: AttachedMast) -> Killed:
         if found.damaged:
             wrong = f"{path.name}: {found.damaged} damaged chunks before its end"
         out = path.with_suffix(".repaired")
-        if repair([path], out).messages != _by_the_library(out):
+        if repair([path], out)["messages"] != _by_the_library(out):
             wrong = f"{path.name}: the library reads another count from the repaired file"
         out.unlink()
     if numbers != list(range(1, len(numbers) + 1)):

@@ -94,13 +94,12 @@ def _repair(args: argparse.Namespace) -> Answer:
 
     out = args.out or args.file.with_name(f"{args.file.stem}.repaired.mcap")
     found = repair(recording_files(args.file), out)
-    document = {
-        "file": str(out), "messages": found.messages, "seconds": found.seconds, "damaged": found.damaged,
-        "left_over_bytes": found.left_over_bytes, "was_complete": found.was_complete,
-    }  # fmt: skip
-    lost = f", {found.damaged} damaged chunks were left out" if found.damaged else ""
-    lost += f", {found.left_over_bytes} bytes at the end were no record" if found.left_over_bytes else ""
-    return Answer(document, f"{out}: {found.messages} messages, {found.seconds:.1f} s{lost}")
+    document = {"file": str(out), **found, "was_complete": found["complete"]}
+    del document["complete"]
+    damaged, left_over = found["damaged"], found["left_over_bytes"]
+    lost = f", {damaged} damaged chunks were left out" if damaged else ""
+    lost += f", {left_over} bytes at the end were no record" if left_over else ""
+    return Answer(document, f"{out}: {found['messages']} messages, {found['seconds']:.1f} s{lost}")
 
 
 @command(

@@ -17,6 +17,7 @@ from calib.files.yaml_text import dump_mapping, parse_mapping
 from drivers.recordings.frames import McapFrame, read_frames, recording_files
 from drivers.recordings.mcap_file import BadRecording, McapContents, McapEntry, read_items
 from mastctl.packaged import driver_of_hardware
+from mastctl.recorder.repair import contents_of
 from mastctl.recorder.writer import Attached
 
 log = logging.getLogger(__name__)
@@ -64,17 +65,11 @@ class Recording:
 
     def summary(self) -> dict[str, Any]:
         """Return what it holds as JSON."""
-        first = [one.first_ns for one in self.found if one.first_ns is not None]
-        last = [one.last_ns for one in self.found if one.last_ns is not None]
         return {
             "file": str(self.path),
             "files": len(self.files),
             "size_mb": sum(path.stat().st_size for path in self.files) / 1e6,
-            "seconds": (max(last) - min(first)) / 1e9 if first else 0.0,
-            "messages": sum(one.messages for one in self.found),
-            "complete": all(one.complete for one in self.found),
-            "damaged": sum(one.damaged for one in self.found),
-            "left_over_bytes": sum(one.left_over_bytes for one in self.found),
+            **contents_of(self.found),
             "masts": [{"name": one.name, "digest": digest} for digest, (one, _) in self.masts.items()],
             "config": None if self.config is None else self.config.name,
             "operations": len(self.operations),

@@ -155,7 +155,7 @@ def test_cut_off_at_any_byte_it_keeps_the_chunks_before_for_repair(tmp_path: Pat
         assert not found.complete and not found.damaged
         counts.add(len(there))
         out = tmp_path / f"{length}-whole.mcap"
-        assert repair([cut], out).messages == len(there)
+        assert repair([cut], out)["messages"] == len(there)
         assert [one["number"] for one in records(out, "/command")] == there
     assert counts == {0, 10, 20, 30}
 
@@ -171,7 +171,7 @@ def test_a_chunk_that_was_damaged_is_passed_over_and_told(tmp_path: Path) -> Non
     assert numbers(path, found) == [*range(10), *range(20, 30)]
     assert found.damaged == 1
     repaired = repair([path], tmp_path / "out.mcap")
-    assert (repaired.messages, repaired.damaged) == (20, 1)
+    assert (repaired["messages"], repaired["damaged"]) == (20, 1)
 
 
 def test_segments_become_one_file_with_each_attached_file_once(tmp_path: Path) -> None:
@@ -179,7 +179,7 @@ def test_segments_become_one_file_with_each_attached_file_once(tmp_path: Path) -
     for part in parts:
         small(part)
     out = tmp_path / "both.mcap"
-    assert repair(parts, out).messages == 60
+    assert repair(parts, out)["messages"] == 60
     with out.open("rb") as file:
         reader = make_reader(file, validate_crcs=True)
         assert [one.name for one in reader.iter_attachments()] == [CONFIG.name]
