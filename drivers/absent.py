@@ -74,8 +74,8 @@ def stop_at_last(stop: Callable[[], object], clock: Clock, device: str) -> None:
             if clock.now_s() < until_s:
                 clock.sleep(FIRST_WAIT_S)
                 continue
-            words = "the last stop was not confirmed; 'mastctl stop --without-daemon' stops the head"
-            log.warning("%s: %s: %s", device, words, error)
+            message = "the last stop was not confirmed; 'mastctl stop --without-daemon' stops the head"
+            log.warning("%s: %s: %s", device, message, error)
         return
 
 
@@ -86,7 +86,7 @@ def begin_opening(name: str, make: Callable[[], Any]) -> Opening:
     def work() -> None:
         try:
             opening.set_result(make())
-        except BaseException as error:  # it belongs to whoever asks for the result
+        except BaseException as error:  # it belongs to the caller of the result
             opening.set_exception(error)
 
     threading.Thread(target=work, name=f"opening {name}", daemon=True).start()
@@ -104,13 +104,7 @@ def let_go(opening: Opening) -> None:
 
 
 class AbsentCamera(Camera):
-    """Stands for a camera until it can be opened.
-
-    Parameters
-    ----------
-    opening
-        An opening that is under way already; or
-    """
+    """Stands for a camera until it can be opened."""
 
     def __init__(
         self,
@@ -137,7 +131,7 @@ class AbsentCamera(Camera):
     def error(self) -> DriverError | None:
         """Why the last opening failed; None while one is under way, or when it is there."""
         error = self._absence.error
-        return None if error is None else self._told(error, "")
+        return None if error is None else self._named(error, "")
 
     def appeared(self) -> Camera:
         """Return the camera if it is open by now, and see to it that it is tried; never waits.
@@ -197,20 +191,20 @@ class AbsentCamera(Camera):
             self._absence.note(fault, now_s)
 
     def _why(self, now_s: float) -> DriverError:
-        """Why it is not there, in words."""
+        """Why it is not there."""
         error = self._absence.error
         if error is None:
-            words = (
+            message = (
                 f"driver {self._driver!r} has been opening it for {now_s - self._since_s:.0f} s; "
                 "it joins by itself when the driver returns"
             )
-            return DriverError(words, device=self._name)
+            return DriverError(message, device=self._name)
         again = f"; tried again every {LONGEST_WAIT_S:g} s, it joins by itself"
-        return self._told(error, "absent since the start: ", again)
+        return self._named(error, "absent since the start: ", again)
 
-    def _told(self, error: DriverError, before: str, after: str = "") -> DriverError:
-        """The same error with the camera's name in front, and words around its own."""
+    def _named(self, error: DriverError, before: str, after: str = "") -> DriverError:
+        """The same error with the camera's name in front, and text around its own."""
         own = str(error).removeprefix(f"{self._name}: ")
-        told = DriverError(f"{before}{own}{after}", device=self._name, detail=error.detail)
-        told.code = error.code
-        return told
+        named = DriverError(f"{before}{own}{after}", device=self._name, detail=error.detail)
+        named.code = error.code
+        return named

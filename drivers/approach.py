@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from calib.files.records import problem
 from drivers.errors import OutOfRange
-from drivers.options import DriverOptions, Ends
+from drivers.options import Ascending, DriverOptions
 
 _STRETCH: Any = {
     "if": {"required": ["approach"], "properties": {"approach": {"not": {"const": "none"}}}},
@@ -24,7 +24,7 @@ class ApproachedAxis(DriverOptions):
 
     model_config = ConfigDict(json_schema_extra=_STRETCH)
 
-    limits_rad: Annotated[tuple[float, float], Ends()]
+    limits_rad: Annotated[tuple[float, float], Ascending()]
     """What may be commanded; set in the device too, if it can be."""
     sign: Literal[1, -1] = 1
     """1 if the device counts up where the axis turns positive, else -1."""

@@ -23,7 +23,7 @@ class Signal(Protocol):
         ...
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
     ) -> Any:
         """Let go of its lock."""
         ...
@@ -80,41 +80,18 @@ class Clock(Protocol):
         ...
 
 
-class _MachineSignal:
-    """A condition in real time; it costs a call of a bus less than `threading.Condition` does."""
+class _MachineSignal(threading.Condition):
+    """A condition in real time."""
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._waiting: list[threading.Lock] = []
-
-    def __enter__(self) -> None:
-        self._lock.acquire()
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._lock.release()
+        super().__init__(threading.Lock())
 
     def wait(self, timeout_s: float | None = None, *, idle: bool = False) -> bool:
-        told = threading.Lock()
-        told.acquire()
-        self._waiting.append(told)
-        self._lock.release()
-        try:
-            return told.acquire(timeout=-1 if timeout_s is None else max(0.0, timeout_s))
-        finally:
-            self._lock.acquire()
-            if told in self._waiting:
-                self._waiting.remove(told)
-
-    def notify_all(self) -> None:
-        waiting, self._waiting = self._waiting, []
-        for told in waiting:
-            told.release()
+        return super().wait(None if timeout_s is None else max(0.0, timeout_s))
 
 
 class _MachineTime:
-    """Signals and threads of a clock that waits for nobody's computing."""
+    """Signals and threads of a clock that waits for no thread's computing."""
 
     runs = True
     stands_for_work = False
@@ -160,9 +137,7 @@ class ClockLock:
     def __enter__(self) -> None:
         self.acquire()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.release()
 
 

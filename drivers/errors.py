@@ -14,8 +14,6 @@ class DriverError(Exception):
 
     Parameters
     ----------
-    message
-        One plain sentence.
     device
         The device's name, put before the message.
     detail
@@ -31,7 +29,7 @@ class DriverError(Exception):
 
 
 class BadOptions(DriverError):
-    """The configuration asks a driver for something that it does not have."""
+    """The configuration names something that a driver does not have."""
 
     code = "bad_options"
 
@@ -85,13 +83,13 @@ class HardwareFault(DriverError):
 
 
 class WatchdogTripped(DriverError):
-    """The device stopped by itself since its host was silent; moving again must be asked for anew."""
+    """The device stopped by itself since its host was silent; moving again must be requested anew."""
 
     code = "watchdog_tripped"
 
 
 class NoFreshFrame(DriverError):
-    """No frame exposed after the asked moment came in time; the message says what came instead."""
+    """No frame exposed after the requested moment came in time; the message says what came instead."""
 
     code = "no_fresh_frame"
 

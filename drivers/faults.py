@@ -65,7 +65,7 @@ HEAD_WORDS: Mapping[str, Word] = MappingProxyType(
             "read-out angles are off by a constant, the motion is right", {"offset_rad": 0.0349, **_AXIS}
         ),
         "slow": Word(
-            "speed is this fraction of what was asked, and acceleration from rest; it brakes as ever",
+            "speed is this fraction of what was requested, and acceleration from rest; it brakes as ever",
             {"factor": 0.05, **_AXIS},
         ),
         "delayed": Word("commands are executed at once, every reply comes this much late", {"delay_s": 0.5}),
@@ -223,13 +223,7 @@ class _Entry:
 
 
 class FaultPanel:
-    """The switches of all faults of one simulated rover; safe from any thread.
-
-    Parameters
-    ----------
-    cameras
-        Names of the cameras; the head is ``pan_tilt``, the daemon's log ``log``.
-    """
+    """The switches of all faults of one simulated rover; safe from any thread."""
 
     def __init__(self, now_s: Callable[[], float], cameras: Iterable[str]) -> None:
         self._now_s = now_s
@@ -253,15 +247,6 @@ class FaultPanel:
 
         Raises BadOptions for an unknown device, word or parameter, or a value that is not a number within its
         bounds.
-
-        Parameters
-        ----------
-        device
-            ``pan_tilt``, a camera's name, or ``log``.
-        word
-            A key of ``HEAD_WORDS``, ``CAMERA_WORDS`` or ``LOG_WORDS``.
-        **parameters
-            Those of the word, and ``after_s`` and ``for_s`` of every word.
         """
         fault = self._fault(device, word, parameters)
         with self._lock:

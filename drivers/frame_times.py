@@ -37,7 +37,7 @@ def corrected(camera: Camera, offset_s: float) -> Camera:
 
 
 class CorrectedCamera(Camera):
-    """Made by `corrected`. What it is asked beside pictures and their times goes to the camera."""
+    """Made by `corrected`. What is requested beside pictures and their times goes to the camera."""
 
     def __init__(self, camera: Camera, offset_s: float) -> None:
         self._camera = camera
@@ -66,7 +66,7 @@ class CorrectedCamera(Camera):
                 return dataclasses.replace(frame, **changes)
             return Frame(frame.image, frame.sequence, **changes)
         except (AttributeError, TypeError, ValueError):
-            return frame  # no frame at all: the service refuses it in its own words
+            return frame  # no frame at all: the service refuses it itself
 
     def close(self) -> None:
         """Let go of the camera."""
@@ -133,13 +133,7 @@ class Offset:
 
 @dataclass(frozen=True)
 class Pace:
-    """What a camera's driver says of its frames' times.
-
-    Attributes
-    ----------
-    period_s, trigger
-        As `drivers.interfaces.CameraInfo` has them.
-    """
+    """What a camera's driver says of its frames' times."""
 
     period_s: float
     trigger: str
@@ -200,25 +194,17 @@ def _measured_period_s(nominal_s: float, times: Sequence[FrameTime]) -> float:
 
 
 class Pairing:
-    """Tells, while frames of several cameras are taken, which camera's next one is still needed.
-
-    Parameters
-    ----------
-    offsets
-        What is known of each camera beside the first one, by name.
-    first
-        The first camera's name; all others are paired with it.
-    """
+    """Decides, while frames of several cameras are taken, which camera's next one is still needed."""
 
     def __init__(self, first: str, offsets: Mapping[str, Offset]) -> None:
         self._first = first
         self._offsets = dict(offsets)
 
     def moments(self, exposed_after_s: float) -> dict[str, float]:
-        """Return after which moment to ask each camera, so that the first frames to come belong together.
+        """Return after which moment to query each camera, so that the first frames to come belong together.
 
-        Each moment is no earlier than asked, and where the cameras' rhythm is known half a period before an
-        expected frame.
+        Each moment is no earlier than requested, and where the cameras' rhythm is known half a period before
+        an expected frame.
         """
         rhythm = self._rhythm()
         if rhythm is None or rhythm.began_s is None:
@@ -229,15 +215,15 @@ class Pairing:
         return {self._first: first_s} | {n: first_s + (o.usual_s or 0.0) for n, o in self._offsets.items()}
 
     def _rhythm(self) -> Offset | None:
-        """An offset that tells when frames are to be expected; None unless it is known of all cameras."""
+        """An offset that shows when frames are to be expected; None unless it is known of all cameras."""
         known = [offset for offset in self._offsets.values() if offset.usual_s is not None]
         return known[0] if known and len(known) == len(self._offsets) else None
 
     def again(self, frames: Mapping[str, Stamped]) -> dict[str, float]:
-        """Return after which moment to ask which cameras again; none if all frames belong together.
+        """Return after which moment to query which cameras again; none if all frames belong together.
 
-        Where the rhythm is known all are asked anew, since those whose frame is newer do not wait. But counts
-        that stamps contradict show only in frames that stand still.
+        Where the rhythm is known all are queried anew, since those whose frame is newer do not wait. But
+        counts that stamps contradict show only in frames that stand still.
         """
         behind = self.behind(frames)
         counted = any(offset.counts_apart is not None for offset in self._offsets.values())
@@ -264,7 +250,8 @@ class Pairing:
 
 
 def _late_s(one: Stamped, other: Stamped, offset: Offset) -> float | None:
-    """How much later the other frame is than the one's partner: 0 if it is the partner, None if who knows."""
+    """How much later the other frame is than the one's partner: 0 if it is the partner, None if that is not
+    known."""
     dt_s = other.exposure_began_s - one.exposure_began_s
     apart = abs(dt_s) > offset.period_s / 2 + SLOP_S
     if offset.counts_apart is not None:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from drivers.clock import Clock, SystemClock
@@ -38,21 +38,18 @@ CLOSING_S = 10.0
 def clock_for(settings: HardwareSettings) -> Clock:
     """Return the clock that these devices live on: the simulation's, if it is not to go as life does.
 
-    Raises
-    ------
-    BadOptions
-        If the speed is none, or a device cannot follow it, since its driver runs in real time.
+    Raises BadOptions if the speed is none, or a device cannot follow it, since its driver runs in real time.
     """
     speed = simulation_speed(settings.simulation.get("speed", 1.0))
     if speed == 1.0:
         return SystemClock()
-    words = f"simulation.speed is {settings.simulation['speed']}, expected 1:"
+    message = f"simulation.speed is {settings.simulation['speed']}, expected 1:"
     devices: dict[Kind, Mapping[str, DeviceSettings]]
     devices = {"head": {PAN_TILT: settings.pan_tilt}, "camera": settings.cameras}
     for kind, named in devices.items():
         for name, device in named.items():
             if not driver_of(kind, device.driver, name).any_clock:
-                raise BadOptions(f"{words} driver {device.driver!r} runs in real time", device=name)
+                raise BadOptions(f"{message} driver {device.driver!r} runs in real time", device=name)
     return SimulationClock(speed)
 
 
@@ -100,10 +97,6 @@ class HardwareSettings:
 
     Attributes
     ----------
-    pan_tilt
-        The head.
-    cameras
-        Cameras by name, as in the mast file.
     simulation
         The ``simulation`` section, which makes the one rover that all ``sim`` devices share.
     folder
@@ -121,8 +114,6 @@ class Hardware:
 
     Attributes
     ----------
-    pan_tilt, cameras
-        The devices.
     kind
         ``real``, ``simulated``, ``replayed``, or ``mixed``: by the drivers, and for devices of a real one by
         their ``info``.
@@ -161,12 +152,7 @@ class Hardware:
     def __enter__(self) -> Hardware:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.close()
 
 

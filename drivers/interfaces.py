@@ -34,8 +34,6 @@ class Reading:
         Whether an axis is under way or not yet in position.
     time_s
         When it was measured, seconds of CLOCK_MONOTONIC.
-    faults
-        Plain words for what the device itself reports as wrong; empty when healthy.
     """
 
     pan_rad: float
@@ -89,17 +87,13 @@ class AxisReport:
     Attributes
     ----------
     commanded_rad
-        The angle that was asked for; None before the first move, and after a stop.
+        The angle that was requested; None before the first move, and after a stop.
     goal_counts, measured_counts
         The nearest count to it, and what the servo measures.
-    goal_rad, measured_rad
-        The same as angles.
     side
         From which side the axis came last: on which flank the gears rest.
     backlash_rad
         Of the gears, as their maker states it; None where nothing is stated.
-    current_A, temperature_C, voltage_V
-        As the device measures them; None for what it does not.
     count_rad
         One count; None where it is not known.
     """
@@ -168,13 +162,9 @@ class HeadInfo:
 
     Attributes
     ----------
-    simulated
-        Whether it only plays a head.
     stops_beside
         Whether its ``stop`` is confirmed sooner beside a call under way than after it: then a stop does not
         wait for the call.
-    motion
-        How ``pan`` and ``tilt`` move; empty where that is not known.
     settles_within_counts
         How many counts from its goal an axis may stand when it calls itself settled.
     """
@@ -206,11 +196,11 @@ class PanTilt(ABC):
 
     @property
     def info(self) -> HeadInfo:
-        """What it states of itself. Asks no device, never fails."""
+        """What it states of itself. Queries no device, never fails."""
         return HeadInfo()
 
     def report(self) -> Mapping[str, AxisReport]:
-        """Return the counts of ``pan`` and ``tilt`` as last read; empty for a head that has none. Asks no
+        """Return the counts of ``pan`` and ``tilt`` as last read; empty for a head that has none. Queries no
         device, never fails.
         """
         return {}
@@ -239,16 +229,12 @@ class CameraSetting:
 
     Attributes
     ----------
-    name
-        One of `SETTINGS`, which also has its unit.
     value
         None if it is not known: its automatic is on, or the camera does not say.
     minimum, maximum, step
         Its bounds; a step of 0: any value between them.
-    automatic
-        Whether the camera's own automatic sets it.
     refusal
-        Why it cannot be changed, in words that follow its name; empty if it can.
+        Why it cannot be changed, as the end of a sentence that begins with its name; empty if it can.
     """
 
     name: str
@@ -273,15 +259,13 @@ class CameraInfo:
 
     Attributes
     ----------
-    simulated
-        Whether it only plays a camera.
     size_px
         (width, height) of every picture that it gives.
     sensor_mode
         Which pixels of its sensor its pictures show, as it was when the camera was opened; no picture of
         another mode is given.
     period_s
-        From frame to frame, seconds, of a camera that takes frames at a steady rate, asked or not.
+        From frame to frame, seconds, of a camera that takes frames at a steady rate, requested or not.
     trigger
         The name of what exposes its frames; cameras of one trigger expose together. Empty: free-running.
     """
@@ -300,10 +284,7 @@ class Camera(ABC):
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
         """Return a frame whose exposure began after ``exposed_after_s``, within ``timeout_s`` seconds.
 
-        Raises
-        ------
-        NoFreshFrame
-            If none came in time; the message says what came instead.
+        Raises NoFreshFrame if none came in time; the message says what came instead.
         """
 
     @abstractmethod
@@ -340,9 +321,6 @@ class Camera(ABC):
         They are within their bounds. Frames exposed from the return on have them, or None for them.
         A camera that went away and came back has them still.
 
-        Raises
-        ------
-        BadSetting, DriverError
-            If the camera refuses one; those before it have changed.
+        Raises BadSetting, DriverError if the camera refuses one; those before it have changed.
         """
         raise BadSetting(f"this camera has no {min(wanted)} that can be changed while it runs")

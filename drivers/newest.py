@@ -1,38 +1,60 @@
-"""The newest good frame of a camera, between the thread that captures and those that ask for frames.
+"""The newest good frame of a camera, between the thread that captures and the threads that request frames.
 
 The frame stays where the driver put it until the next one is there. Its picture is made from there when a
-caller first asks, once for all that ask: a frame without a request is not converted and not copied.
+caller first requests it, once for all callers: a frame without a request is not converted and not copied.
 """
 
 from __future__ import annotations
 
+import logging
 import threading
 import time
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Generic, Protocol, TypeVar
+from functools import partial
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
-from drivers.errors import BadFrame, NoCamera, NoFreshFrame
-from drivers.interfaces import Camera, CameraSetting, Frame, FrameTime, Image
+from drivers.errors import BadFrame, DriverError, NoCamera, NoFreshFrame
+from drivers.interfaces import Camera, Frame, FrameTime, Image
+from drivers.values_set import ValuesSet
 
 RECENT_FRAMES = 30  # a second's: from their times the offset between two cameras is learned
-ROUNDING_S = 1e-9  # a frame told by its middle and length is not newer than itself
+ROUNDING_S = 1e-9  # a frame stated by its middle and length is not newer than itself
+LATE_S = 0.005  # a frame is late if it comes more than a period and this after its stamp
+FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.05, 1.0  # between tries to open a camera that is there and fails
+CLOSE_PATIENCE_S = 2.0  # for the thread to end: a device that died may hold it
+
+log = logging.getLogger(__name__)
 
 
-class Window(Protocol):
-    """In which stretch of time a frame was exposed."""
+class ExposureWindow(NamedTuple):
+    """A stretch of time in which the whole exposure lay, seconds of CLOCK_MONOTONIC."""
+
+    begin_s: float
+    end_s: float
 
     @property
-    def begin_s(self) -> float: ...
+    def mid_s(self) -> float:
+        """The middle: the best guess of mid-exposure."""
+        return (self.begin_s + self.end_s) / 2
+
+    @property
+    def length_s(self) -> float:
+        """From its begin to its end."""
+        return self.end_s - self.begin_s
+
+    def mid_uncertainty_s(self, exposure_s: float | None) -> float:
+        """Return the most that mid-exposure may be from the middle; less if the exposure is known."""
+        return max(0.0, self.length_s - (exposure_s or 0.0)) / 2
 
 
 class Kept(Protocol):
     """A frame, as far as this module needs it."""
 
     @property
-    def window(self) -> Window: ...
+    def window(self) -> ExposureWindow: ...
 
     @property
     def sequence(self) -> int: ...
@@ -54,8 +76,6 @@ class TimedFrame(Frame):
     stamp_s, received_s
         The stamp (of the kernel, or of the camera's own clock), and when the frame was whole, by
         CLOCK_MONOTONIC; seconds.
-    driver_sequence, stream
-        The driver's or the camera's own count, and the stream's number.
     """
 
     mid_uncertainty_s: float
@@ -122,9 +142,9 @@ class Newest(Generic[Arrived]):
         return self._frame
 
     def instead(self, exposed_after_s: float, timeout_s: float, damaged_before: int, now_s: float) -> str:
-        """Return what to say when no fresh frame came, in plain words."""
+        """Return what to say when no fresh frame came, in one sentence."""
         counters, last = self.counters, self.frame
-        message = f"no frame exposed after the asked moment came within {timeout_s:.3g} s"
+        message = f"no frame exposed after the requested moment came within {timeout_s:.3g} s"
         if damaged := counters.damaged - damaged_before:
             message += f"; {damaged} came damaged ({counters.last_damage})"
         if last is None:
@@ -240,22 +260,58 @@ class Newest(Generic[Arrived]):
         self._recent.clear()
 
 
-class CapturedCamera(Camera):
-    """A camera whose ``capture`` has a thread of its own and a `Newest`; safe from any thread."""
+class CapturedCamera(Camera, Generic[Arrived]):
+    """A camera with a thread of its own, which takes frames until closed, and opens it again when it fails.
 
-    capture: Any
-    name: str
-    _last: TimedFrame | None = None
+    Safe from any thread. A camera that cannot be opened at first raises DriverError.
+
+    Attributes
+    ----------
+    gone_pause_s
+        Between tries to open a camera that is not there, where that disturbs nothing; 0: as of others.
+    """
+
+    gone_pause_s = 0.0
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.newest: Newest[Arrived] = Newest()
+        self._over = threading.Event()
+        self._opening = threading.Lock()  # guards what is adjusted, and which values are in force
+        self._in_force: Mapping[str, ValuesSet] = {}  # of the stream that was opened last
+        self._pause_s = FIRST_PAUSE_S
+        self._thread: threading.Thread | None = None
+        self._last: TimedFrame | None = None
 
     @abstractmethod
-    def _timed(self, arrived: Any, image: Image, jpeg: bytes) -> TimedFrame:
+    def _open(self) -> Any:
+        """Return the opened stream. Raises DriverError."""
+
+    @abstractmethod
+    def _stream(self, stream: Any) -> None:
+        """Take frames until `_over`. Raises DriverError when the camera fails."""
+
+    @abstractmethod
+    def _let_go(self, stream: Any) -> None:
+        """Close a stream; the newest frame is forgotten."""
+
+    @abstractmethod
+    def _is_young(self, frame: Arrived) -> bool:
+        """Whether a frame is the last one that should be here by now."""
+
+    @abstractmethod
+    def _timed(self, arrived: Arrived, image: Image, jpeg: bytes) -> TimedFrame:
         """Return a frame that arrived, with its picture."""
+
+    @property
+    def lost(self) -> str:
+        """Why there are no frames now: the camera is gone or its stream failed; empty while it streams."""
+        return self.newest.lost
 
     @property
     def counters(self) -> Counters:
         """The counts of good, damaged and missing frames so far."""
-        counters: Counters = self.capture.newest.counters
-        return counters
+        return self.newest.counters
 
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> TimedFrame:
         """Return the newest frame whose exposure surely began after ``exposed_after_s``, waiting if need be.
@@ -264,14 +320,13 @@ class CapturedCamera(Camera):
         came within ``timeout_s`` seconds; the message says what came instead; NoCamera (at once, if the
         camera is gone).
         """
-        newest: Newest[Any] = self.capture.newest
-        damaged = newest.counters.damaged
-        taken = self.capture.take(exposed_after_s, timeout_s)
+        damaged = self.newest.counters.damaged
+        taken = self.newest.take(exposed_after_s, timeout_s, self._is_young)
         if taken is None:
-            if lost := newest.lost:
+            if lost := self.newest.lost:
                 raise NoCamera(lost)
-            words = newest.instead(exposed_after_s, timeout_s, damaged, self.now_s())
-            raise NoFreshFrame(words, device=self.name)
+            message = self.newest.instead(exposed_after_s, timeout_s, damaged, self.now_s())
+            raise NoFreshFrame(message, device=self.name)
         if self._last is None or self._last.image is not taken[1]:
             self._last = self._timed(*taken)
         return self._last
@@ -282,14 +337,64 @@ class CapturedCamera(Camera):
 
     def recent_times(self) -> list[FrameTime]:
         """Return the times of the last good frames of this stream, oldest first."""
-        return [FrameTime(frame.sequence, frame.window.begin_s) for frame in self.capture.newest.recent()]
+        return [FrameTime(frame.sequence, frame.window.begin_s) for frame in self.newest.recent()]
 
-    def settings(self) -> Sequence[CameraSetting]:
-        """Return exposure, gain, white balance and focus, as far as it has them. Raises DriverError."""
-        settings: Sequence[CameraSetting] = self.capture.settings()
-        return settings
+    def await_settled(self, timeout_s: float) -> None:
+        """Wait until a frame came that shows no setting of before, or none will, for so long at most."""
+        self.newest.wait_until(lambda: all(one.settled for one in self._in_force.values()), timeout_s)
 
-    def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
-        """Change some of them, as `drivers.interfaces.Camera.adjust`."""
-        notes: Sequence[str] = self.capture.adjust(wanted)
-        return notes
+    def close(self) -> None:
+        """End the thread and let go of the camera; one that hangs is left behind after 2 s."""
+        if not self.newest.close():
+            return
+        self._over.set()
+        if self._thread is not None:
+            self._thread.join(CLOSE_PATIENCE_S)
+            if self._thread.is_alive():
+                log.warning("%s: its driver hangs; it is closed when the driver comes back", self.name)
+
+    def _begin(self, stream: Any) -> None:
+        """Start the thread, with a stream that is open."""
+        serve = partial(self._serve, stream)
+        self._thread = threading.Thread(target=serve, name=f"capture {self.name}", daemon=True)
+        self._thread.start()
+
+    def _serve(self, stream: Any) -> None:
+        """Take frames, and open again after every failure, until closed."""
+        while True:
+            if stream is not None:
+                try:
+                    self._stream(stream)
+                    return
+                except DriverError as error:
+                    self._lose(str(error))
+                except Exception as error:  # a defect here must not end in a thread that is silently gone
+                    log.exception("%s: the capture failed", self.name)
+                    self._lose(f"{self.name}: the capture failed: {type(error).__name__}: {error}")
+                finally:
+                    self.newest.forget()
+                    self._let_go(stream)
+            if self._over.wait(self._pause_s):
+                return
+            self._pause_s = min(2 * self._pause_s, LONGEST_PAUSE_S)
+            stream = self._reopened()
+
+    def _lose(self, why: str) -> None:
+        """Note that there are no frames for now."""
+        if self.newest.lose(why):
+            log.warning("%s; it is opened again when it is back", why)
+
+    def _reopened(self) -> Any:
+        """Try to open the camera again; None if it is not back."""
+        try:
+            stream = self._open()
+        except Exception as error:
+            if isinstance(error, NoCamera):
+                self._pause_s = self.gone_pause_s or self._pause_s
+            elif not isinstance(error, DriverError):  # a defect: the thread goes on trying, and says so
+                log.exception("%s: opening again failed", self.name)
+            self.newest.lose(str(error) or type(error).__name__)
+            return None
+        self.newest.come_back()
+        log.warning("%s is back", self.name)
+        return stream

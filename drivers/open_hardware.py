@@ -33,19 +33,10 @@ def open_hardware(settings: HardwareSettings, clock: Clock | None = None) -> Har
     A camera that cannot be reached is absent (`AbsentCamera`), as is one whose opening takes longer than
     `OPENING_PATIENCE_S`; it joins when it can be opened. A head is waited for `HEAD_OPENING_S`.
 
-    Parameters
-    ----------
-    clock
-        Time for simulated and replayed devices, as a rule that of `drivers.hardware.clock_for`; the machine's
-        monotonic clock when left out.
-
-    Raises
-    ------
-    BadOptions
-        For a driver that does not exist or cannot be loaded, and options that it refuses.
-    DriverError
-        From a driver that cannot reach its head; NoReply if it does not return in time. Devices opened
-        before are closed again, and those that come later too.
+    ``clock`` is time for simulated and replayed devices, as a rule that of `drivers.hardware.clock_for`; the
+    machine's monotonic clock when left out. Raises BadOptions for a driver that does not exist or cannot be
+    loaded, and options that it refuses; DriverError from a driver that cannot reach its head; NoReply if it
+    does not return in time. Devices opened before are closed again, and those that come later too.
     """
     opener = _Opener(settings, clock or SystemClock())
     devices: dict[str, Any] = {}
@@ -66,11 +57,6 @@ def halt_head(settings: HardwareSettings) -> list[str]:
     Nothing is set up, no other device is opened. A head whose driver has no ``halt`` is opened, stopped and
     closed. Raises BadOptions if the settings say too little; DriverError if the head did not confirm; it may
     still move.
-
-    Returns
-    -------
-    list of str
-        The actions on each axis, in plain words.
     """
     device = settings.pan_tilt
     driver = driver_of("head", device.driver, PAN_TILT)
@@ -126,8 +112,8 @@ class _Opener:
                     PAN_TILT, device.driver, OPENING_PATIENCE_S, HEAD_OPENING_S,
                 )  # fmt: skip
                 if not _ended(opening, HEAD_OPENING_S - OPENING_PATIENCE_S):
-                    words = f"driver {device.driver!r} did not open it within {HEAD_OPENING_S:g} s"
-                    raise NoReply(f"{words}: its factory has not returned", device=PAN_TILT)
+                    message = f"driver {device.driver!r} did not open it within {HEAD_OPENING_S:g} s"
+                    raise NoReply(f"{message}: its factory has not returned", device=PAN_TILT)
             head: PanTilt = opening.result()
             return head
         except BaseException:
@@ -186,13 +172,13 @@ def open_device(kind: Kind, name: str, options: Mapping[str, Any], context: Cont
     except DriverError:
         raise
     except (Exception, SystemExit) as error:  # a foreign driver may raise anything: one sentence reports it
-        words = f"driver {name!r} refuses the options {dict(options)!r} ({one_line(error)})"
-        raise BadOptions(words, device=context.name) from error
+        message = f"driver {name!r} refuses the options {dict(options)!r} ({one_line(error)})"
+        raise BadOptions(message, device=context.name) from error
     wanted = PanTilt if kind == "head" else Camera
     missing = [method for method in METHODS[wanted] if not callable(getattr(made, method, None))]
     if missing:
-        words = f"driver {name!r} made a {type(made).__name__} without {', '.join(missing)}"
-        raise BadOptions(words, device=context.name)
+        message = f"driver {name!r} made a {type(made).__name__} without {', '.join(missing)}"
+        raise BadOptions(message, device=context.name)
     return whole(made, wanted)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, TypeGuard, TypeVar
 
@@ -20,8 +20,6 @@ from calib.errors import BadFile
 from calib.files.records import Record, problem, read_record
 from drivers.errors import BadOptions
 from drivers.faults import nearest
-
-_KINDS = {bool: "true or false", tuple: "a list", str: "text"}
 
 
 def is_number(value: object) -> TypeGuard[int | float]:
@@ -111,7 +109,7 @@ def wholes(count: int, low: int, high: int) -> ReadBy:
 
 
 @dataclass(frozen=True)
-class Ends:
+class Ascending:
     """Annotates ``[low, high]``, the lower first, both within bounds."""
 
     low: float = -1e9
@@ -132,36 +130,5 @@ class Ends:
 def check_in_frame(key: str, exposure_s: float | None, rate_hz: float | None) -> None:
     """Refuse, in a validator, an exposure time for which a camera would have to stretch its frames."""
     if exposure_s is not None and rate_hz is not None and exposure_s > 1 / rate_hz:
-        words = f"{exposure_s:g} s, longer than a frame at rate_hz {rate_hz:g} ({1 / rate_hz:.4g} s)"
-        raise problem(key, f"{words}; a shorter one, or a lower rate, is expected")
-
-
-def filled(defaults: Any, values: Any, key: str) -> Any:
-    """Return a settings dataclass with values replaced by those of a mapping. Raises BadOptions."""
-    if not isinstance(values, Mapping):
-        raise BadOptions(f"{key} is {values!r}, expected keys and values")
-    known = {f.name: getattr(defaults, f.name) for f in fields(defaults)}
-    changes: dict[str, Any] = {}
-    for name, value in values.items():
-        if name not in known:
-            raise BadOptions(f"{key} has no key {name!r}{nearest(str(name), known)}")
-        kind = type(known[name])
-        if is_dataclass(known[name]):
-            value = filled(known[name], value, f"{key}.{name}")
-        elif kind in (int, float):
-            if not (is_whole(value) if kind is int else is_number(value)):
-                what = "a whole number" if kind is int else "a number"
-                raise BadOptions(f"{key}.{name} is {value!r}, expected {what}")
-            value = kind(value)
-        elif not isinstance(value, kind):
-            raise BadOptions(f"{key}.{name} is {value!r}, expected {_KINDS.get(kind, kind.__name__)}")
-        changes[str(name)] = value
-    return replace(defaults, **changes)
-
-
-def check_bounds(settings: Any, bounds: Mapping[str, tuple[float, float]], key: str) -> None:
-    """Pass numbers that lie within their bounds. Raises BadOptions with the first that does not."""
-    for name, (low, high) in bounds.items():
-        value = getattr(settings, name)
-        if not low <= value <= high:
-            raise BadOptions(f"{key}.{name} is {value!r}, expected a number from {low:g} to {high:g}")
+        message = f"{exposure_s:g} s, longer than a frame at rate_hz {rate_hz:g} ({1 / rate_hz:.4g} s)"
+        raise problem(key, f"{message}; a shorter one, or a lower rate, is expected")

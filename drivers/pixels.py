@@ -27,10 +27,6 @@ class PictureFormat:
 
     Attributes
     ----------
-    code
-        Of `FORMATS` or `GENICAM`.
-    size_px
-        (width, height).
     stride_bytes
         From one row to the next, of the first plane; 0 for compressed formats.
     field
@@ -70,6 +66,13 @@ class Layout:
     packing: Packing = "mipi"
 
 
+_ORDERS = ("BGGR", "GBRG", "GRBG", "RGGB")
+_BAYER = {
+    (8, 0): "BA81 GBRG GRBG RGGB", (10, 0): "BG10 GB10 BA10 RG10", (12, 0): "BG12 GB12 BA12 RG12",
+    (16, 0): "BYR2 GB16 GR16 RG16", (10, 4): "pBAA pGAA pgAA pRAA", (12, 2): "pBCC pGCC pgCC pRCC",
+}  # fmt: skip
+"""Of V4L2, by bits and samples that share a byte, in these orders."""
+
 FORMATS = MappingProxyType(
     {
         "GREY": Layout("grey"),
@@ -86,33 +89,13 @@ FORMATS = MappingProxyType(
         "BGR3": Layout("bgr"),
         "MJPG": Layout("jpeg"),
         "JPEG": Layout("jpeg"),
-        "BA81": Layout("bayer", 8, "BGGR"),
-        "GBRG": Layout("bayer", 8, "GBRG"),
-        "GRBG": Layout("bayer", 8, "GRBG"),
-        "RGGB": Layout("bayer", 8, "RGGB"),
-        "BG10": Layout("bayer", 10, "BGGR"),
-        "GB10": Layout("bayer", 10, "GBRG"),
-        "BA10": Layout("bayer", 10, "GRBG"),
-        "RG10": Layout("bayer", 10, "RGGB"),
-        "BG12": Layout("bayer", 12, "BGGR"),
-        "GB12": Layout("bayer", 12, "GBRG"),
-        "BA12": Layout("bayer", 12, "GRBG"),
-        "RG12": Layout("bayer", 12, "RGGB"),
-        "pBAA": Layout("bayer", 10, "BGGR", 4),
-        "pGAA": Layout("bayer", 10, "GBRG", 4),
-        "pgAA": Layout("bayer", 10, "GRBG", 4),
-        "pRAA": Layout("bayer", 10, "RGGB", 4),
-        "pBCC": Layout("bayer", 12, "BGGR", 2),
-        "pGCC": Layout("bayer", 12, "GBRG", 2),
-        "pgCC": Layout("bayer", 12, "GRBG", 2),
-        "pRCC": Layout("bayer", 12, "RGGB", 2),
-        "BYR2": Layout("bayer", 16, "BGGR"),
-        "GB16": Layout("bayer", 16, "GBRG"),
-        "GR16": Layout("bayer", 16, "GRBG"),
-        "RG16": Layout("bayer", 16, "RGGB"),
+        **{
+            code: Layout("bayer", bits, order, packed)
+            for (bits, packed), codes in _BAYER.items()
+            for code, order in zip(codes.split(), _ORDERS, strict=True)
+        },
     }
 )
-
 """Of V4L2, by four-character code."""
 
 
@@ -124,7 +107,7 @@ def _genicam() -> dict[str, Layout]:
         "YUV422_8": Layout("yuyv"), "YCbCr422_8": Layout("yuyv"),
         "YUV422_8_UYVY": Layout("uyvy"), "YUV422Packed": Layout("uyvy"),
     }  # fmt: skip
-    orders = {"BayerBG": "BGGR", "BayerGB": "GBRG", "BayerGR": "GRBG", "BayerRG": "RGGB"}
+    orders = {f"Bayer{order[:2]}": order for order in _ORDERS}
     for name, order in {"Mono": "", **orders}.items():
         kind: Kind = "bayer" if order else "grey"
         for bits in (8, 10, 12, 14, 16):

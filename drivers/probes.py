@@ -17,12 +17,8 @@ class ProbedHead(ABC):
 
     Attributes
     ----------
-    driver, port
-        Its driver, and its line as this machine names it.
     usable
         Whether it can be the head of a configuration.
-    speed_rad_per_s
-        A usual limit.
     """
 
     driver: str
@@ -49,12 +45,8 @@ class ProbedCamera:
 
     Attributes
     ----------
-    card, bus
-        Its names.
     node
         Its node now, which udev knows; None for a camera without one.
-    options, driver
-        Its options, and of which driver they are.
     """
 
     card: str

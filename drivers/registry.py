@@ -42,14 +42,8 @@ class Context:
 
     Attributes
     ----------
-    name
-        The device's name, for errors and logs.
-    clock
-        The time of all devices of the configuration.
     folder
         Where relative paths in options start: the configuration's folder.
-    simulation
-        The configuration's section of that name.
     shared
         What devices of one configuration have in common, by a key of the driver's own, such as one simulated
         rover. What has a ``close`` is closed after the devices.
@@ -79,7 +73,7 @@ class Driver:
         Raises BadOptions.
     halt
         ``halt(options)`` stops a head that no daemon drives any more, and returns the actions on each axis in
-        plain words. Raises DriverError if the head did not confirm.
+        sentences. Raises DriverError if the head did not confirm.
     probe
         Of a head: ``probe(port, path)`` returns the `drivers.probes.ProbedHead` on a line, or None, and a
         reason that may be empty; DriverError: no other head is to be tried. Of cameras: ``probe()`` returns
@@ -102,17 +96,7 @@ class Driver:
 
 @dataclass(frozen=True)
 class InstalledDriver:
-    """A driver that an installed package offers.
-
-    Attributes
-    ----------
-    kind, name
-        The device that it drives, and its name in a configuration.
-    path
-        ``package.module:name`` of the `Driver` or factory.
-    distribution, version
-        Of the package.
-    """
+    """A driver that an installed package offers."""
 
     kind: Kind
     name: str
@@ -152,11 +136,6 @@ def _installed(folders: tuple[tuple[str, int], ...]) -> Sequence[InstalledDriver
     return tuple(dict.fromkeys(found))
 
 
-def kinds_of(driver: str) -> set[Kind]:
-    """Return which devices a driver of that name drives; nothing for one that no package offers."""
-    return {one.kind for one in installed_drivers() if one.name == driver}
-
-
 def drivers_of(kind: Kind) -> Mapping[str, Driver]:
     """Return every installed driver of a kind that can be imported, by name, in the order of probing."""
     found: dict[str, Driver] = {}
@@ -168,21 +147,9 @@ def drivers_of(kind: Kind) -> Mapping[str, Driver]:
 
 
 def driver_of(kind: Kind, driver: str, device: str) -> Driver:
-    """Return a driver by its name in a configuration.
+    """Return a driver by the name by which a package offers it, or its path ``package.module:name``.
 
-    Parameters
-    ----------
-    kind
-        The device that it is to drive.
-    driver
-        The name by which a package offers it, or its path ``package.module:name``.
-    device
-        Put before a message.
-
-    Raises
-    ------
-    BadOptions
-        If no package offers it for this kind, several do, or it cannot be imported.
+    Raises BadOptions if no package offers it for this kind, several do, or it cannot be imported.
     """
     path = driver if ":" in driver else _path_of(kind, driver, device)
     found = _object(path, device)
@@ -200,8 +167,8 @@ def _path_of(kind: Kind, driver: str, device: str) -> str:
         packages = " and ".join(one.package for one in fitting)
         raise BadOptions(f"{packages} both offer a driver {driver!r}; uninstall one of them", device=device)
     if named:
-        words = f"driver {driver!r} of {named[0].package} is for a {named[0].kind}, not for a {kind}"
-        raise BadOptions(words, device=device)
+        message = f"driver {driver!r} of {named[0].package} is for a {named[0].kind}, not for a {kind}"
+        raise BadOptions(message, device=device)
     known = [one.name for one in installed if one.kind == kind]
     raise BadOptions(
         f"there is no driver {driver!r}{nearest(driver, known)}; a driver from outside is named "
@@ -216,8 +183,8 @@ def _object(name: str, device: str) -> Any:
     try:
         found: Any = importlib.import_module(module_name)
     except (Exception, SystemExit) as error:  # whatever a foreign module does while it is imported
-        words = f"driver {name!r}: cannot import {module_name!r} ({one_line(error)})"
-        raise BadOptions(words, device=device) from error
+        message = f"driver {name!r}: cannot import {module_name!r} ({one_line(error)})"
+        raise BadOptions(message, device=device) from error
     for part in attribute.split("."):
         if not hasattr(found, part):
             raise BadOptions(f"driver {name!r}: {module_name!r} has no {attribute!r}", device=device)

@@ -181,8 +181,8 @@ class SerialLine:
         except _BROKEN as error:
             raise self._lost("reading", error) from error
         if not data:
-            words = f"{self.port} hung up (unplugged?)"
-            raise LineLost(words, device=self._device, detail=self._at("reading"))
+            message = f"{self.port} hung up (unplugged?)"
+            raise LineLost(message, device=self._device, detail=self._at("reading"))
         return data
 
     def close(self) -> None:
@@ -204,11 +204,11 @@ class SerialLine:
             own = {} if self._is_url else {"exclusive": True, "write_timeout": WRITE_TIMEOUT_S}
             return serial.serial_for_url(self.port, baudrate=self.baud, timeout=SLICE_S, **own)
         except (ValueError, TypeError, OverflowError, NotImplementedError) as error:
-            words = f"{self.port} at {self.baud} baud: {_words(error)}"
-            raise BadOptions(words, device=self._device) from error
+            message = f"{self.port} at {self.baud} baud: {_reason(error)}"
+            raise BadOptions(message, device=self._device) from error
         except (OSError, EOFError, termios.error) as error:
-            words = f"{self.port} cannot be opened: {_words(error)}{_unit_hint(self.port)}"
-            raise LineLost(words, device=self._device, detail=self._at("opening it")) from error
+            message = f"{self.port} cannot be opened: {_reason(error)}{_unit_hint(self.port)}"
+            raise LineLost(message, device=self._device, detail=self._at("opening it")) from error
 
     def _read_of_object(self, wait_s: float) -> bytes:
         """The same for a line without a file descriptor."""
@@ -220,15 +220,15 @@ class SerialLine:
                 return data
 
     def _lost(self, doing: str, error: BaseException) -> LineLost:
-        words = f"{self.port} failed in {doing} (unplugged?): {_words(error)}"
-        return LineLost(words, device=self._device, detail=self._at(doing))
+        message = f"{self.port} failed in {doing} (unplugged?): {_reason(error)}"
+        return LineLost(message, device=self._device, detail=self._at(doing))
 
     def _at(self, doing: str) -> dict[str, object]:
         return {"port": self.port, "while": doing}
 
 
 def _unit_hint(port: str) -> str:
-    """What an address that is not reached may lack in a service: systemd drops its packets without a word."""
+    """What an address that is not reached may lack in a service: systemd drops its packets silently."""
     if "://" not in port or "INVOCATION_ID" not in os.environ:
         return ""
     return "; if it is on and answers elsewhere, the unit has to allow its address (IPAddressAllow)"
@@ -242,7 +242,7 @@ def _written(descriptor: int, data: bytes) -> int:
         return 0
 
 
-def _words(error: BaseException) -> str:
+def _reason(error: BaseException) -> str:
     """What a low-level exception says, on one line, without what the caller says already."""
     number = (
         error.args[0] if isinstance(error, termios.error) and error.args else getattr(error, "errno", None)

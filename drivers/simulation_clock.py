@@ -25,7 +25,6 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import TracebackType
 from typing import Any
 
 from drivers.errors import BadOptions
@@ -82,8 +81,6 @@ class SimulationClock:
     ----------
     speed
         Seconds of this clock in a second of real time, at most; infinite to wait for nothing.
-    start_s
-        Its first reading, seconds.
     """
 
     runs = True
@@ -311,9 +308,7 @@ class SimulationSignal:
     def __enter__(self) -> None:
         self._lock.acquire()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self._lock.release()
 
     def wait(self, timeout_s: float | None = None, *, idle: bool = False) -> bool:

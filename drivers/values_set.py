@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import threading
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+
+from drivers.errors import BadSetting, DriverError
+
+SAME = 1e-6  # of a value that went through the camera's own number format
 
 SETTLE_FRAMES = 4
 """So many frames stamped after a change may still show what was set before it: the one that was being read
@@ -64,7 +70,7 @@ class ValuesSet:
     ) -> tuple[float | None, float | None]:
         """Return a frame's value and the highest that it may have; None for what is not known.
 
-        Frames are asked for in their order; one that was stamped before a change knows nothing of it.
+        Frames are requested in their order; one that was stamped before a change knows nothing of it.
         ``began_s`` is given where a frame's exposure may have begun before its stamp: then a frame counts as
         later than a change only if it began after it.
         """
@@ -87,3 +93,47 @@ class ValuesSet:
             return None, None
         highest = max(known)
         return (highest if min(known) == highest else None), highest
+
+
+SetOne = Callable[[str, float], tuple[float | None, str, str]]
+"""Sets one setting, by name; returns its value now, why it was refused, and what bounds its values."""
+
+
+def change_each(
+    wanted: Iterable[tuple[str, float]],
+    in_force: Mapping[str, ValuesSet],
+    set_one: SetOne,
+    now_s: Callable[[], float],
+    device: str,
+) -> tuple[dict[str, float], list[str], DriverError | None]:
+    """Change settings one after the other, and note from which frame on each is in force.
+
+    Returns
+    -------
+    became
+        The new value of each that was changed, as the camera has it.
+    notes
+        A sentence for each that became another than requested.
+    refused
+        The error of one that the camera did not take; those behind it were left alone.
+    """
+    became: dict[str, float] = {}
+    notes: list[str] = []
+    for name, value in wanted:
+        if name not in in_force:
+            return became, notes, BadSetting(f"it has no control for {name}", device=device)
+        in_force[name].begin(now_s())
+        now = None
+        try:
+            now, refused, bounds = set_one(name, value)
+        except DriverError as error:
+            return became, notes, error
+        finally:
+            in_force[name].end(now, now_s())
+        if refused or now is None:
+            reason = refused or "its automatic stays on"
+            return became, notes, BadSetting(f"{name} was not changed: {reason}", device=device)
+        became[name] = now
+        if not math.isclose(now, value, rel_tol=SAME, abs_tol=1e-12):
+            notes.append(f"{device}: {name} is {now:.6g} where {value:.6g} was requested{bounds}")
+    return became, notes, None

@@ -1,21 +1,68 @@
-"""The driver ``aravis``: a GigE Vision or USB3 Vision camera whose frames are never older than asked for."""
+"""The driver ``aravis``: a GigE Vision or USB3 Vision camera whose frames are never older than requested."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import logging
+import math
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 from drivers import pixels
 from drivers.aravis import find
-from drivers.aravis.capture import ArrivedGenicam, GenicamCapture
+from drivers.aravis.camera_clock import CameraClock, ClockStepped
+from drivers.aravis.device import Device, Filled
 from drivers.aravis.options import AravisOptions, parse_options
+from drivers.aravis.settings import EXPOSURE
 from drivers.clock import Clock
-from drivers.interfaces import CameraInfo, Image
-from drivers.newest import CapturedCamera, TimedFrame
+from drivers.errors import NoCamera, StreamFailed
+from drivers.interfaces import CameraInfo, CameraSetting, Image
+from drivers.newest import (
+    CLOSE_PATIENCE_S,
+    FIRST_PAUSE_S,
+    LATE_S,
+    CapturedCamera,
+    ExposureWindow,
+    TimedFrame,
+)
 from drivers.probes import CameraBench
 from drivers.registry import Driver
+from drivers.values_set import ValuesSet
+
+log = logging.getLogger(__name__)
+
+SETTLE_S = 1.0  # for a change to show
+WAIT_S = 0.1  # for a frame: so long after the last one a loss or the end is looked for
+SILENT_S, SILENT_PERIODS = 1.0, 5  # a free-running camera that gives nothing for so long is opened again
+READ_CLOCK_EVERY_S = 1.0
+LEARNING_FRAMES = 4  # where a clock cannot be read, these show how soon a frame may come
+DELAYED_S, DELAYED_FRAMES = 1.0, 5  # so many frames that come so late: the camera's clock was set back
+CLOSING_S = 1.0
+
+
+class ArrivedGenicam(NamedTuple):
+    """A good frame, without its picture.
+
+    Attributes
+    ----------
+    filled, window
+        The buffer with the camera's own count and stamp, and in which the whole exposure lay.
+    settings
+        Those of this frame, by name: as it came with them, else as they were set; None for what is not known.
+    sequence, stream
+        Our own count, which grows over every reopening, and the number of the stream.
+    """
+
+    filled: Filled
+    window: ExposureWindow
+    settings: Mapping[str, float | None]
+    sequence: int
+    stream: int
+    received_s: float
 
 
 def open_camera(options: Mapping[str, Any], clock: Clock | None = None, name: str = "aravis") -> AravisCamera:
@@ -28,31 +75,42 @@ def open_camera(options: Mapping[str, Any], clock: Clock | None = None, name: st
     return AravisCamera(parse_options(options, name), name)
 
 
-class AravisCamera(CapturedCamera):
-    """One camera; safe from any thread."""
-
-    capture: GenicamCapture
+class AravisCamera(CapturedCamera[ArrivedGenicam]):
+    """One camera, as `CapturedCamera`."""
 
     def __init__(self, options: AravisOptions, name: str) -> None:
-        self.name = name
+        super().__init__(name)
         self._options = options
-        self.capture = GenicamCapture(options, name, pixels.colour if options.colour else pixels.grey)
+        self._convert = pixels.colour if options.colour else pixels.grey
+        self._adjusted: dict[str, float] = {}
+        self._longest_s: float  # of an exposure that is not known
+        self._clock: CameraClock
+        self._streams = 0
+        self._last_sequence = -1
+        self._last_number: int | None = None
+        self._kept_buffer: int | None = None
+        self._delayed = 0
+        self._device: Device | None = None
+        device = self._open()
+        self.format, self.period_s = device.format, device.period_s
+        self.sensor_mode = device.sensor_mode
+        self.problems, self.camera_name = tuple(device.problems), device.camera_name
+        self._begin(device)
 
     @property
     def info(self) -> CameraInfo:
         """Size and sensor mode, its period and the name of its hardware trigger."""
-        capture = self.capture
         return CameraInfo(
-            size_px=capture.format.size_px,
-            sensor_mode=capture.sensor_mode,
+            size_px=self.format.size_px,
+            sensor_mode=self.sensor_mode,
             period_s=self._period_s(),
             trigger=self._options.trigger,
         )
 
     def _period_s(self) -> float:
         """From frame to frame, as the camera states it; of a triggered one, between its last frames."""
-        if self.capture.period_s is not None:
-            return self.capture.period_s
+        if self.period_s is not None:
+            return self.period_s
         times = self.recent_times()
         if len(times) < 2:
             return 1.0
@@ -64,7 +122,8 @@ class AravisCamera(CapturedCamera):
         """Wait until a change that was made before shows, for a second at most: a measurement compares
         pictures. Inside the block the exposure is as the camera's features leave it.
         """
-        self.capture.await_settled()
+        if self._options.free_running:
+            self.await_settled(SETTLE_S)
         yield
 
     def _timed(self, arrived: ArrivedGenicam, image: Image, jpeg: bytes) -> TimedFrame:
@@ -75,7 +134,7 @@ class AravisCamera(CapturedCamera):
             sequence=arrived.sequence,
             mid_exposure_s=window.mid_s,
             exposure_s=window.length_s,
-            mid_uncertainty_s=max(0.0, window.length_s - (exposure_s or 0.0)) / 2,
+            mid_uncertainty_s=window.mid_uncertainty_s(exposure_s),
             set_exposure_s=exposure_s,
             stamp_s=arrived.filled.stamp_s,
             received_s=arrived.received_s,
@@ -83,9 +142,168 @@ class AravisCamera(CapturedCamera):
             stream=arrived.stream,
         )
 
-    def close(self) -> None:
-        """Let go of the camera; a waiting call ends with NoFreshFrame."""
-        self.capture.close()
+    def _is_young(self, frame: ArrivedGenicam) -> bool:
+        """Whether no newer one should be here: a triggered camera's stays young."""
+        if self.period_s is None or not self._options.free_running:
+            return True
+        return time.monotonic() - frame.received_s <= self.period_s + LATE_S
+
+    def settings(self) -> list[CameraSetting]:
+        """Return what may be changed, as the camera has it now. Raises DriverError."""
+        return self._there().settings()
+
+    def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
+        """Change settings; a stream that is opened later has them too. Raises BadSetting, DriverError."""
+        self._there()
+        with self._opening:
+            device = self._there()
+            self._allow(wanted.get(EXPOSURE.name, 0.0))
+            became, notes, refused = device.change(wanted, self._in_force)
+            self._adjusted |= became
+            self._allow(became.get(EXPOSURE.name, 0.0))
+        if refused is not None:
+            raise refused
+        return notes
+
+    def _there(self) -> Device:
+        """The camera that streams. Raises NoCamera if it is gone."""
+        device = self._device
+        if device is None or self.newest.lost:
+            raise NoCamera(self.newest.lost or f"{self.name}: it is being opened again")
+        return device
+
+    def _allow(self, exposure_s: float) -> None:
+        """Take in that exposures may become so long."""
+        self._longest_s = max(self._longest_s, exposure_s)
+        self._clock.least_delay_s = self._least_delay_s()
+
+    def _least_delay_s(self) -> float:
+        """How late the quickest frame's first packet comes after its stamp, at most."""
+        return self._options.margin_s + (0.0 if self._options.stamp == "end" else self._longest_s)
+
+    # In the capture thread
+
+    def _let_go(self, device: Device) -> None:
+        """Close a stream before it is opened again; wait only a second for a camera that is gone."""
+        self._device = None
+        self._kept_buffer = None
+        closing = threading.Thread(target=device.close, name=f"closing {self.name}", daemon=True)
+        closing.start()
+        closing.join(CLOSE_PATIENCE_S if self._over.is_set() else CLOSING_S)
+
+    def _open(self) -> Device:
+        with self._opening:
+            device = Device(self._options, self.name, self._adjusted)
+            if self._streams and device.sensor_mode != self.sensor_mode:
+                device.close()
+                message = f"it came back with {device.sensor_mode} where it had {self.sensor_mode}"
+                raise StreamFailed(message, device=self.name)
+            self._longest_s = device.values.get(EXPOSURE.name) or device.period_s or 1.0
+            self._clock = CameraClock(self._least_delay_s())
+            self._in_force = {name: ValuesSet(value) for name, value in device.values.items()}
+        self._device = device
+        self._streams += 1
+        self._last_number, self._delayed, self._learned = None, 0, 0
+        return device
+
+    def _stream(self, device: Device) -> None:
+        """Take frames until closed. Raises DriverError when the camera fails."""
+        heard_s = time.monotonic()
+        silent_s = max(SILENT_S, SILENT_PERIODS * (device.period_s or 0.0))
+        read_next_s = self._read_clock(device, heard_s)
+        while not self._over.is_set():
+            filled = device.wait(WAIT_S)
+            now_s = time.monotonic()
+            if device.lost.is_set():
+                message = "it no longer answers: unplugged, without power, or taken over"
+                raise NoCamera(message, device=self.name)
+            if filled is not None:
+                heard_s = now_s
+                self._take(device, filled, now_s)
+                if now_s >= read_next_s:
+                    read_next_s = self._read_clock(device, now_s)
+                continue
+            if self._options.free_running and now_s - heard_s > silent_s:
+                raise StreamFailed(
+                    f"it gave no frame for {now_s - heard_s:.1f} s (its cable, its power?)",
+                    device=self.name,
+                )
+
+    def _read_clock(self, device: Device, now_s: float) -> float:
+        """Read the camera's clock, where it can be; return when to do it next."""
+        if (reading := device.read_clock()) is None:
+            return math.inf
+        try:
+            self._clock.read(*reading)
+        except ClockStepped as error:
+            raise StreamFailed(str(error), device=self.name) from None
+        return now_s + READ_CLOCK_EVERY_S
+
+    def _take(self, device: Device, filled: Filled, received_s: float) -> None:
+        """Check one buffer; publish it if it is good, and give the last one back, else itself."""
+        dropped = self._count(filled)
+        wrong = filled.wrong
+        if not wrong:
+            try:
+                self._clock.arrived(filled.stamp_s, filled.arrived_s)
+            except ClockStepped as error:
+                raise StreamFailed(str(error), device=self.name) from None
+            wrong = self._wrong_delay(filled)
+        self._learned += not wrong
+        learning = not self._clock.readings and self._learned <= LEARNING_FRAMES
+        if wrong or learning:
+            self.newest.refuse(dropped, wrong)
+            device.queue(filled.handle)
+            return
+        window = self._window(filled, self._longest_s)
+        settings: dict[str, float | None] = {}
+        for name, values in self._in_force.items():
+            settings[name], highest = values.of(self._last_sequence, window.end_s, window.begin_s)
+            if name == EXPOSURE.name and highest is not None:
+                window = self._window(filled, highest)
+        settings |= filled.sent
+        if sent_s := filled.sent.get(EXPOSURE.name):
+            window = self._window(filled, sent_s)
+        frame = ArrivedGenicam(filled, window, settings, self._last_sequence, self._streams, received_s)
+        self.newest.publish(frame, partial(self._made, device, filled.handle), dropped=dropped, late=False)
+        previous, self._kept_buffer = self._kept_buffer, filled.handle
+        if previous is not None:
+            device.queue(previous)
+        self._pause_s = FIRST_PAUSE_S
+
+    def _window(self, filled: Filled, longest_s: float) -> ExposureWindow:
+        """In which stretch of our time a frame was exposed, for so long at most."""
+        return self._clock.window(filled.stamp_s, self._options.stamp, longest_s, filled.arrived_s)
+
+    def _made(self, device: Device, handle: int) -> tuple[Image, bytes]:
+        """The picture of a buffer."""
+        data, format = device.bytes_of(handle)
+        return self._convert(format, data), b""
+
+    def _count(self, filled: Filled) -> int:
+        """Count a frame; return how many are missing before it, as far as its number says."""
+        step = 1
+        if self._last_number is not None:
+            step = filled.number - self._last_number
+            if step <= 0 and self._last_number < 2**16:
+                step += 2**16 - 1  # the count of 16 bits leaves out 0
+            if not 0 < step < 2**15:  # it began again: nothing says how many that cost
+                step = 1
+        self._last_number = filled.number
+        self._last_sequence += step
+        return step - 1
+
+    def _wrong_delay(self, filled: Filled) -> str:
+        """Why a frame comes too late to be believed; empty if it does not. Raises StreamFailed for many."""
+        delay_s = filled.arrived_s - filled.stamp_s - self._clock.high_s
+        if delay_s <= DELAYED_S + self._longest_s:
+            self._delayed = 0
+            return ""
+        self._delayed += 1
+        message = f"it came {delay_s:.3g} s later after its stamp than others"
+        if self._delayed >= DELAYED_FRAMES:
+            raise StreamFailed(f"{message}, as {self._delayed} before; was its clock set?", device=self.name)
+        return message
 
 
 DRIVER = Driver(

@@ -11,9 +11,9 @@ from __future__ import annotations
 import math
 from collections import deque
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 from drivers.aravis.options import Stamped
+from drivers.newest import ExposureWindow
 
 DRIFT = 1e-4
 """100 ppm: two crystals of 50 ppm each, in opposite directions; usual ones have 20 to 50."""
@@ -47,22 +47,6 @@ class WallClock:
 
 class ClockStepped(Exception):
     """The camera's clock was set, or began again: nothing that was known of it holds."""
-
-
-class GenicamWindow(NamedTuple):
-    """A stretch of our time in which the whole exposure lay, seconds of CLOCK_MONOTONIC."""
-
-    begin_s: float
-    end_s: float
-
-    @property
-    def mid_s(self) -> float:
-        """The middle: the best guess of mid-exposure."""
-        return (self.begin_s + self.end_s) / 2
-
-    @property
-    def length_s(self) -> float:
-        return self.end_s - self.begin_s
 
 
 @dataclass
@@ -112,7 +96,7 @@ class CameraClock:
                 self.low_s = above_s - self.least_delay_s
         self._check()
 
-    def window(self, stamp_s: float, stamped: Stamped, longest_s: float, arrived_s: float) -> GenicamWindow:
+    def window(self, stamp_s: float, stamped: Stamped, longest_s: float, arrived_s: float) -> ExposureWindow:
         """Return in which stretch of our time a frame was exposed.
 
         Parameters
@@ -122,7 +106,7 @@ class CameraClock:
         """
         begin_s = stamp_s + self.low_s - (0.0 if stamped == "start" else longest_s)
         end_s = stamp_s + self.high_s + (0.0 if stamped == "end" else longest_s)
-        return GenicamWindow(begin_s, max(begin_s, min(end_s, arrived_s)))
+        return ExposureWindow(begin_s, max(begin_s, min(end_s, arrived_s)))
 
     def _widen(self, now_s: float) -> None:
         """Let the bounds grow by what the clocks may have drifted apart."""

@@ -1,4 +1,4 @@
-"""One opened camera: its features set as asked and checked, its buffers, and its clock read."""
+"""One opened camera: its features set as requested and checked, its buffers, and its clock read."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -19,11 +19,11 @@ from drivers.aravis import find
 from drivers.aravis.camera_clock import WallClock
 from drivers.aravis.library import CONTROL_LOST, GenicamError, library
 from drivers.aravis.options import AravisOptions
-from drivers.aravis.settings import CHUNKS, EXPOSURE, ROUNDING, Control, Feature, change, set_up, settings_of
+from drivers.aravis.settings import CHUNKS, EXPOSURE, Control, Feature, change, set_up, settings_of
 from drivers.errors import CameraBusy, DriverError, NoCamera, StreamFailed, UnsupportedFormat
 from drivers.interfaces import CameraSetting
 from drivers.pixels import GENICAM, PictureFormat
-from drivers.values_set import ValuesSet
+from drivers.values_set import SAME, ValuesSet
 
 log = logging.getLogger(__name__)
 
@@ -50,8 +50,6 @@ class Filled(NamedTuple):
 
     Attributes
     ----------
-    wrong
-        Why it is no good frame; empty if it is.
     number
         The camera's count: 16 bits that leave out 0, or 64 bits.
     stamp_s, arrived_s
@@ -86,8 +84,6 @@ class Device:
         As the camera answered; a triggered camera has a period of None.
     values
         Its settings by name, as they are at the opening; None for one that its automatic sets.
-    sensor_mode
-        Which pixels of the sensor frames show, as far as the camera reports it.
     lost
         Set when the camera no longer obeys: it was unplugged, or another program took it.
     """
@@ -101,7 +97,7 @@ class Device:
         self._wall = WallClock()
         self._parser: int | None = None
         self._chunks: list[Feature] = []
-        self._longest_s, self._told_chunk = math.inf, False
+        self._longest_s, self._chunk_warned = math.inf, False
         self._stream: int | None = None
         self._latch: tuple[str, str] | None = None
         self._control_lost = CONTROL_LOST(
@@ -115,13 +111,13 @@ class Device:
             self._begin()
         except GenicamError as error:
             self.close()
-            raise self._told(error) from None
+            raise self._opening_error(error) from None
         except BaseException:
             self.close()
             raise
 
     def _set_up(self) -> None:
-        """Set everything that is asked for, and check the answers."""
+        """Set everything that is requested, and check the answers."""
         arv, camera, options = self._arv, self._camera, self._options
         device = arv("camera_get_device", camera)
         for name, value in options.features.items():
@@ -161,7 +157,7 @@ class Device:
         sentence = (
             f"the camera does not take {requested[2]}x{requested[3]} px at ({requested[0]}, {requested[1]})"
         )
-        # Aravis writes what it is told, and not every camera refuses what it cannot do.
+        # Aravis writes what it is given, and not every camera refuses what it cannot do.
         for side, (low, high) in zip(options.size_px, bounds.values(), strict=True):
             if not low <= side <= high:
                 raise UnsupportedFormat(f"{sentence}; it has {offered}", device=self._name)
@@ -280,7 +276,7 @@ class Device:
         arv("camera_start_acquisition", camera)
 
     @property
-    def words(self) -> str:
+    def camera_name(self) -> str:
         """Maker, model and serial number."""
         names = ("vendor_name", "model_name", "device_serial_number")
         return " ".join(self._arv(f"camera_get_{name}", self._camera) or "?" for name in names)
@@ -314,7 +310,7 @@ class Device:
 
     def change(
         self, wanted: Mapping[str, float], in_force: Mapping[str, ValuesSet]
-    ) -> tuple[dict[str, float], Sequence[str], DriverError | None]:
+    ) -> tuple[dict[str, float], list[str], DriverError | None]:
         """Change settings, as `drivers.aravis.settings.change`. Raises NoCamera if it was closed."""
         with self._feature_lock:
             self._check_open()
@@ -360,13 +356,13 @@ class Device:
             with suppress(GenicamError):  # not in this frame
                 chunk = self._arv("chunk_parser_get_float_value", self._parser, handle, f"Chunk{one.feature}")
                 value = one.unit * float(chunk)
-                highest = self._longest_s * (1 + ROUNDING)
+                highest = self._longest_s * (1 + SAME)
                 if math.isfinite(value) and (one is not EXPOSURE or 0.0 < value <= highest):
                     values[one.name] = value
-                elif not self._told_chunk:
-                    self._told_chunk = True
-                    words = "%s: a frame came with %s %.6g, which cannot be; such values are left out"
-                    log.warning(words, self._name, one.name, value)
+                elif not self._chunk_warned:
+                    self._chunk_warned = True
+                    message = "%s: a frame came with %s %.6g, which cannot be; such values are left out"
+                    log.warning(message, self._name, one.name, value)
         return values
 
     def bytes_of(self, handle: int) -> tuple[NDArray[np.uint8], PictureFormat]:
@@ -386,7 +382,8 @@ class Device:
         self._arv("stream_push_buffer", self._stream, handle)
 
     def close(self) -> None:
-        """Stop and let go; never raises. It takes seconds for a camera that is gone: Aravis asks it again."""
+        """Stop and let go; never raises. It takes seconds for a camera that is gone: Aravis queries it
+        again."""
         with self._feature_lock:
             if self._stream is not None:
                 try:
@@ -399,9 +396,9 @@ class Device:
             self._parser = self._stream = None
             self._camera = 0
 
-    def _told(self, error: GenicamError) -> DriverError:
+    def _opening_error(self, error: GenicamError) -> DriverError:
         """A refusal of Aravis while opening, as one of ours."""
-        words = str(error)
-        if ("ccess" in words and "denied" in words) or "controller" in words.lower():
-            return CameraBusy(f"another program has it ({words})", device=self._name)
-        return StreamFailed(f"it cannot be set up: {words}", device=self._name)
+        reason = str(error)
+        if ("ccess" in reason and "denied" in reason) or "controller" in reason.lower():
+            return CameraBusy(f"another program has it ({reason})", device=self._name)
+        return StreamFailed(f"it cannot be set up: {reason}", device=self._name)

@@ -30,7 +30,7 @@ class FoundGenicam:
     protocol: str
 
     @property
-    def words(self) -> str:
+    def name(self) -> str:
         """Maker, model, serial number and place, in one sentence."""
         return f"{self.vendor} {self.model}, serial number {self.serial}, at {self.address} ({self.protocol})"
 
@@ -44,13 +44,8 @@ def options_for(camera: FoundGenicam, by_serial: bool, fastest_hz: float) -> dic
     """Return options that open a camera as it is now: its format (else the first that is read), region, rate.
 
     Raises DriverError if another program has it, it does not answer, or it has no format that is read.
-
-    Parameters
-    ----------
-    by_serial
-        Whether its serial number names it, else its id.
     """
-    name = camera.words
+    name = camera.name
     arv, handle = library(name), open_camera(AravisOptions(id=camera.id), name)
     try:
         offered = arv.texts("camera_dup_available_pixel_formats_as_strings", handle)
@@ -66,7 +61,7 @@ def options_for(camera: FoundGenicam, by_serial: bool, fastest_hz: float) -> dic
         has_rate = arv("camera_is_frame_rate_available", handle)
         rate_hz = arv("camera_get_frame_rate", handle) if has_rate else 0.0
     except GenicamError as error:
-        raise StreamFailed(f"it cannot be asked: {error}", device=name) from None
+        raise StreamFailed(f"it cannot be queried: {error}", device=name) from None
     finally:
         arv.unref(handle)
     return {
@@ -111,19 +106,19 @@ def open_camera(options: AravisOptions, name: str) -> int:
     try:
         handle: Any = arv("camera_new", key)
     except GenicamError as error:
-        words = str(error)
-        if "control" in words.lower() or "access" in words.lower():
-            raise CameraBusy(f"another program has it ({words})", device=name) from None
-        raise _absent(options, name, _listed(arv), words) from None
+        message = str(error)
+        if "control" in message.lower() or "access" in message.lower():
+            raise CameraBusy(f"another program has it ({message})", device=name) from None
+        raise _absent(options, name, _listed(arv), message) from None
     if not handle:
         raise _absent(options, name, _listed(arv))
     return int(handle)
 
 
 def _absent(options: AravisOptions, name: str, found: list[FoundGenicam], why: str = "") -> NoCamera:
-    connected = "; ".join(one.words for one in found) or "none"
+    connected = "; ".join(one.name for one in found) or "none"
     said = f" ({why})" if why else ""
-    return NoCamera(f"no camera with {options.words} answers{said}; there are: {connected}", device=name)
+    return NoCamera(f"no camera with {options.camera} answers{said}; there are: {connected}", device=name)
 
 
 USUAL_HZ = 30.0
@@ -157,13 +152,13 @@ def present(options: Mapping[str, Any], name: str) -> str:
     connected = list_cameras()
     found = [one for one in connected if is_meant(wanted, one)]
     if not found and wanted.address:
-        return f"no camera with {wanted.words} answers to a search; mastctl camera check says more"
+        return f"no camera with {wanted.camera} answers to a search; mastctl camera check says more"
     if not found:
         raise _absent(wanted, name, connected)
     if len(found) > 1:
         raise BadOptions(_several(wanted, found), device=name)
-    return found[0].words
+    return found[0].name
 
 
 def _several(options: AravisOptions, found: list[FoundGenicam]) -> str:
-    return f"several cameras have {options.words}: {', '.join(one.id for one in found)}; give 'id'"
+    return f"several cameras have {options.camera}: {', '.join(one.id for one in found)}; give 'id'"

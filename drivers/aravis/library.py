@@ -62,7 +62,6 @@ _FUNCTIONS = {
     "arv_camera_set_trigger": "ps>v!",
     "arv_camera_clear_triggers": "p>v!",
     "arv_camera_set_acquisition_mode": "pi>v!",
-    "arv_camera_gv_get_packet_size": "p>u!",
     "arv_camera_gv_set_stream_options": "pi>v",
     "arv_camera_are_chunks_available": "p>i!",
     "arv_camera_set_chunk_mode": "pi>v!",
@@ -96,8 +95,6 @@ _FUNCTIONS = {
     "arv_buffer_get_image_data": "pp>p",
     "arv_buffer_get_image_width": "p>i",
     "arv_buffer_get_image_height": "p>i",
-    "arv_buffer_get_image_padding": "ppp>v",
-    "arv_buffer_get_image_pixel_format": "p>u",
 }
 """Arguments and result by `_TYPES`; ``!``: a GError is the last argument."""
 
@@ -143,9 +140,9 @@ class Library:
             error = ctypes.POINTER(_GError)()
             result = self._functions[name](*given, ctypes.byref(error))
             if error:
-                words = (error.contents.message or b"no reason given").decode(errors="replace")
+                message = (error.contents.message or b"no reason given").decode(errors="replace")
                 self._free_error(error)
-                raise GenicamError(words)
+                raise GenicamError(message)
         return result.decode(errors="replace") if isinstance(result, bytes) else result
 
     def texts(self, name: str, handle: int) -> list[str]:
@@ -193,10 +190,7 @@ def _loaded() -> Library:
 def library(name: str = "") -> Library:
     """Return Aravis, loaded once.
 
-    Raises
-    ------
-    BadOptions
-        If it is not installed; the message says how to install it. ``name`` is the camera's.
+    Raises BadOptions if it is not installed; the message says how to install it. ``name`` is the camera's.
     """
     try:
         return _loaded()

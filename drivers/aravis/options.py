@@ -80,7 +80,7 @@ class AravisOptions(DriverOptions):
         return not self.trigger_source
 
     @property
-    def words(self) -> str:
+    def camera(self) -> str:
         """Which camera, for people."""
         named = (("serial number", self.serial), ("address", self.address), ("id", self.id))
         return " and ".join(f"{what} {value}" for what, value in named if value)

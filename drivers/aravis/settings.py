@@ -9,17 +9,17 @@ from __future__ import annotations
 import ctypes
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from drivers.aravis.library import GenicamError, Library
 from drivers.aravis.options import AravisOptions
-from drivers.errors import BadSetting, DriverError, StreamFailed
+from drivers.errors import DriverError, StreamFailed
 from drivers.interfaces import CameraSetting
-from drivers.values_set import ValuesSet
+from drivers.values_set import SAME, ValuesSet, change_each
 
 OFF = "Off"
-ROUNDING = 1e-6  # of a value that went through the camera's own number format
+NEAREST = ": the camera's nearest"
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,6 @@ class Feature:
 
     Attributes
     ----------
-    name, word
-        As in `drivers.interfaces.SETTINGS`, and in words.
     feature, automatic
         The GenICam names of its value, also as chunk data, and of its automatic.
     called
@@ -61,13 +59,7 @@ CHUNKS = (EXPOSURE, GAIN)
 
 
 class Control:
-    """One setting of one opened camera. Its methods raise GenicamError.
-
-    Attributes
-    ----------
-    exists
-        Whether the camera has it.
-    """
+    """One setting of one opened camera. Its methods raise GenicamError."""
 
     def __init__(self, arv: Library, camera: int, meaning: Feature) -> None:
         self._arv, self._camera, self.meaning = arv, camera, meaning
@@ -170,10 +162,10 @@ def set_up(
 def _other(one: Feature, value: float | None, wanted: float) -> list[str]:
     """A sentence for a value that became another than wanted; none if it did not."""
     if value is None:
-        return [f"{one.name} stays with the camera's automatic where {wanted:.6g} was asked for"]
-    if math.isclose(value, wanted, rel_tol=ROUNDING, abs_tol=1e-12):
+        return [f"{one.name} stays with the camera's automatic where {wanted:.6g} was requested"]
+    if math.isclose(value, wanted, rel_tol=SAME, abs_tol=1e-12):
         return []
-    return [f"{one.name} is {value:.6g} where {wanted:.6g} was asked for: the camera's nearest"]
+    return [f"{one.name} is {value:.6g} where {wanted:.6g} was requested{NEAREST}"]
 
 
 def settings_of(
@@ -206,42 +198,22 @@ def settings_of(
 
 def change(
     arv: Library, camera: int, wanted: Mapping[str, float], in_force: Mapping[str, ValuesSet], device: str
-) -> tuple[dict[str, float], Sequence[str], DriverError | None]:
-    """Change settings one after the other, and note from which frame on each is in force.
+) -> tuple[dict[str, float], list[str], DriverError | None]:
+    """Change settings one after the other, as `change_each`."""
+    meanings = {one.name: one for one in MEANINGS}
 
-    Returns
-    -------
-    became
-        The new value of each that was changed, as the camera has it.
-    notes
-        A sentence for each that became another than asked for.
-    refused
-        The error of one that the camera did not take; those behind it were left alone.
-    """
-    became: dict[str, float] = {}
-    notes: list[str] = []
-    for one in MEANINGS:
-        if one.name not in wanted:
-            continue
-        values, value, why = in_force.get(one.name), None, ""
-        if values is None:
-            return became, notes, BadSetting(f"it has no control for {one.word}", device=device)
-        values.begin(time.monotonic())
+    def set_one(name: str, value: float) -> tuple[float | None, str, str]:
+        reason = ""
         try:
-            control = Control(arv, camera, one)
+            control = Control(arv, camera, meanings[name])
             try:
-                control.set(wanted[one.name])
+                control.set(value)
             except GenicamError as error:
-                why = str(error)
-            value = control.value()
+                reason = str(error)
+            return control.value(), reason, NEAREST
         except GenicamError as error:
-            words = f"it is not known whether {one.name} was changed: {why or error}"
-            return became, notes, StreamFailed(words, device=device)
-        finally:
-            values.end(value, time.monotonic())
-        if why or value is None:
-            words = why or "its automatic stays on"
-            return became, notes, BadSetting(f"{one.name} was not changed: {words}", device=device)
-        became[one.name] = value
-        notes += [f"{device}: {words}" for words in _other(one, value, wanted[one.name])]
-    return became, notes, None
+            message = f"it is not known whether {name} was changed: {reason or error}"
+            raise StreamFailed(message, device=device) from None
+
+    ordered = [(one.name, wanted[one.name]) for one in MEANINGS if one.name in wanted]
+    return change_each(ordered, in_force, set_one, time.monotonic, device)

@@ -27,7 +27,7 @@ class Counter:
     Parameters
     ----------
     sent_s, received_s
-        When that was asked and when it came, seconds of our clock.
+        When that was requested and when it came, seconds of our clock.
     """
 
     def __init__(self, tick: int, sent_s: float, received_s: float) -> None:
@@ -35,13 +35,7 @@ class Counter:
         self._earliest_s, self._latest_s = sent_s - STEP_S, received_s  # when it began to show that
 
     def mismatch(self, tick: int, sent_s: float, received_s: float) -> str:
-        """Take an answer as of its question, or say in words why it cannot be and take nothing.
-
-        Returns
-        -------
-        str
-            Empty if it is.
-        """
+        """Take an answer as of its question, or return why it cannot be and take nothing."""
         passed_s = sent_s - self._earliest_s
         advance_s = (tick - self._tick) * STEP_S
         advance_s += MODULUS_S * round((passed_s - advance_s) / MODULUS_S)
@@ -59,7 +53,7 @@ class Counter:
 
 
 class TickCounters:
-    """Which servo's counter showed what when; for the thread that has the line."""
+    """The counters of the servos on a line; for the thread that has it."""
 
     def __init__(self, link: BusLink) -> None:
         self._link = link
@@ -98,7 +92,7 @@ class TickCounters:
     def _meet(self, servo_id: int, tick_address: int) -> None:
         """Get to know a counter: by two answers, each after a silence, that agree about it.
 
-        No question is asked twice, so that no reply that is some questions late can be taken for another.
+        No question is repeated, so that no reply that is some questions late is of another.
         """
         shapes = iter(MEETING_SHAPES)
         for shape in shapes:
@@ -107,19 +101,18 @@ class TickCounters:
             if not mismatch:
                 self._known[servo_id] = counter
                 return
-        words = f"no two replies are of the moments that they were asked for: {mismatch}"
-        raise self._bad(servo_id, "read", words)
+        raise self._bad(servo_id, "read", f"no two replies are of the moments of their questions: {mismatch}")
 
     def _tick(self, servo_id: int, address: int, shape: tuple[int, int]) -> tuple[int, float, float]:
-        """The counter in a reply of so many bytes around it, and when that was asked and came."""
+        """The counter in a reply of so many bytes around it, and when that was requested and came."""
         before, after = shape
         self._link.quiet(QUIET_S)
         sent_s = self._clock.now_s()
         data = self._link.read(servo_id, address - before, before + 2 + after, "realtime_tick")
         return int.from_bytes(data[before : before + 2], "little"), sent_s, self._clock.now_s()
 
-    def _bad(self, servo_id: int, word: str, words: str) -> BadReply:
+    def _bad(self, servo_id: int, instruction: str, reason: str) -> BadReply:
         return BadReply(
-            f"servo {servo_id} on {self._link.name}: {words}",
-            detail=self._link.where(servo_id, word, "realtime_tick"),
+            f"servo {servo_id} on {self._link.name}: {reason}",
+            detail=self._link.where(servo_id, instruction, "realtime_tick"),
         )

@@ -1,33 +1,32 @@
 """Transactions with servos on one line, each answer proven to be of its question.
 
-A `Link` belongs to one thread at a time. A reply says who speaks, and not what was requested. What proves
+A `Link` belongs to one thread at a time. A reply names its sender, and not what was requested. What proves
 that it is of its question:
 
 - Where it holds the servo's millisecond counter, that shows the moment of the question (`counter`).
-- Where it does not, `Link.proven` asks twice around a silence and wants one answer; what is read for one
+- Where it does not, `Link.proven` reads twice around a silence and wants one answer; what is read for one
   register differs in length from what is read for another (`registers.Register.window`).
 - Of a group read the replies come in the order requested, one of each servo, or none counts.
-- A reply without data (to a write, a restart) proves nothing: who must be certain reads afterwards.
+- A reply without data (to a write, a restart) proves nothing: what must be certain is read afterwards.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
-from drivers.clock import Clock
 from drivers.dynamixel.counter import TickCounters
 from drivers.dynamixel.packets import (
     BROADCAST_ID,
-    ERROR_WORDS,
     PING,
     READ,
     REBOOT,
+    REFUSALS,
     SYNC_WRITE,
     WRITE,
     GroupAnswer,
     GroupQuestion,
-    Part,
     group_question,
     group_write_packet,
     instruction_packet,
@@ -36,18 +35,18 @@ from drivers.dynamixel.packets import (
 )
 from drivers.dynamixel.registers import ControlItem
 from drivers.errors import BadReply, DriverError, LineLost, Refused
-from drivers.serial_line import OpenLine, SerialLine
-from drivers.servo_bus.exchange import REPLY_TIMEOUT_S, BusLink
-from drivers.servo_bus.port import QUIET_S, PacketFormat, StatusPacket
+from drivers.servo_bus.exchange import BusLink
+from drivers.servo_bus.port import QUIET_S, PacketFormat, Part, StatusPacket
 
 PING_REPLY_BYTES = 14
 FORMAT = PacketFormat(
     take_status,
     instruction_packet,
-    lambda address, length: address.to_bytes(2, "little") + length.to_bytes(2, "little"),
+    2,
+    group_write_packet,
     11,
     {PING: "ping", READ: "read", WRITE: "write", REBOOT: "reboot"},
-    ERROR_WORDS,
+    REFUSALS,
     instruction_packet(BROADCAST_ID, SYNC_WRITE, (64).to_bytes(2, "little") + (1).to_bytes(2, "little")),
 )
 AGREEING_TRIES = 5  # of two answers in a row that are to be the same
@@ -66,33 +65,23 @@ class Pinged:
 class Link(BusLink):
     """One open line and its transactions; parameters, attributes and errors as of `BusLink`."""
 
-    def __init__(
-        self,
-        port: str,
-        baud: int,
-        reply_timeout_s: float = REPLY_TIMEOUT_S,
-        urgent: Callable[[], bool] = lambda: False,
-        *,
-        clock: Clock | None = None,
-        open_line: OpenLine = SerialLine,
-    ) -> None:
-        super().__init__(port, baud, reply_timeout_s, FORMAT, urgent, clock, open_line)
-        self._counters = TickCounters(self)
-        self._group_questions: dict[tuple[Part, ...], GroupQuestion] = {}
+    packets = FORMAT
+
+    @cached_property
+    def _counters(self) -> TickCounters:
+        return TickCounters(self)
 
     def ping(self, servo_id: int) -> Pinged:
-        """Ask one servo who it is. Raises NoReply, BadReply, LineLost."""
-        return _pinged(self.ask(servo_id, PING, b"", 3))
+        """Return what a servo says of itself. Raises NoReply, BadReply, LineLost."""
+        return _pinged(self.request(servo_id, PING, b"", 3))
 
     def ping_all(self) -> tuple[list[Pinged], int]:
-        """Ask who is on the line; takes its whole window of about a second.
-
-        Raises LineLost.
+        """Ping every servo on the line; takes its whole window of about a second. Raises LineLost.
 
         Returns
         -------
         list of Pinged, int
-            Who answered, by id; and how many bytes came that were no reply (two servos of one id?).
+            Those that answered, by id; and how many bytes came that were no reply (two servos of one id?).
         """
         port = self.port
         question = instruction_packet(BROADCAST_ID, PING)
@@ -127,8 +116,8 @@ class Link(BusLink):
         found = self._agreed(servo_id, {register.window: register})
         return register.decode_window(found[register.window])
 
-    def heard(self, servo_id: int, register: ControlItem) -> int:
-        """Return what a register seems to be, asked one time and after a silence; raises as `proven`."""
+    def read_once(self, servo_id: int, register: ControlItem) -> int:
+        """Return what a register seems to be, read one time and after a silence; raises as `proven`."""
         self.quiet(QUIET_S)
         return register.decode(self.read(servo_id, *register.window, register.name))
 
@@ -165,24 +154,10 @@ class Link(BusLink):
         except Refused as refused:
             return refused
 
-    def write(self, servo_id: int, register: ControlItem, value: int) -> None:
-        """Set a register and wait for the servo's word that it did.
-
-        Raises NoReply, BadReply, Refused, LineLost.
-        """
-        data = register.address.to_bytes(2, "little") + register.encode(value)
-        self.ask(servo_id, WRITE, data, 0, register.name)
-
-    def write_unanswered(self, servo_id: int, register: ControlItem, value: int) -> None:
-        """Set a register of a servo that is set to keep silent; an answer is dropped. Raises LineLost."""
-        data = register.address.to_bytes(2, "little") + register.encode(value)
-        self.port.send(instruction_packet(servo_id, WRITE, data), 0)
-        self.port.drain()
-
     def reboot(self, servo_id: int) -> None:
         """Restart a servo: torque drops. Raises NoReply, BadReply, Refused, LineLost."""
         self._counters.forget(servo_id)
-        self.ask(servo_id, REBOOT, b"", 0)
+        self.request(servo_id, REBOOT, b"", 0)
 
     def block(self, part: Part) -> GroupAnswer:
         """Read one block of one servo, which is there. Raises as `group_read`, and what is missing."""
@@ -194,16 +169,13 @@ class Link(BusLink):
     def group_read(self, parts: Sequence[Part]) -> GroupAnswer:
         """Read one block of each of several servos in one transaction.
 
-        Servos whose blocks have one address and length are asked by Sync Read, others by Bulk Read. Each
+        Servos whose blocks have one address and length are read by Sync Read, others by Bulk Read. Each
         servo waits for the one before it, so one that is missing may silence those behind it. Blocks that
         hold the servo's counter are taken only if it shows this moment; a servo whose counter is not known
-        yet is asked for it first. Raises LineLost, BadReply if the line is gone or never quiet; everything
+        yet is read for it first. Raises LineLost, BadReply if the line is gone or never quiet; everything
         else stands in the answer's ``missing``.
         """
-        key = tuple(parts)
-        question = self._group_questions.get(key)
-        if question is None:
-            question = self._group_questions[key] = group_question(parts)
+        question = group_question(tuple(parts))
         if (failure := self._counters.learn(question)) is not None:
             now_s = self.clock.now_s()
             return GroupAnswer({}, dict.fromkeys(question.parts, failure), now_s, now_s)
@@ -221,28 +193,6 @@ class Link(BusLink):
                     silence = wrong.get(servo_id) or self.silence(servo_id, "group read", addresses)
                     missing[servo_id] = silence
         return GroupAnswer(statuses, missing, sent_s, received_s)
-
-    def group_write(self, parts: Sequence[Part]) -> None:
-        """Write to several servos with one packet; nobody answers, so read back what must be certain.
-
-        Raises LineLost, BadReply.
-        """
-        try:
-            self.port.send(group_write_packet(parts), 0)
-        except LineLost as error:
-            raise self.placed(error, [part.servo_id for part in parts], "group write") from error
-
-    def write_at_once(self, parts: Sequence[Part], copies: int = 1) -> None:
-        """Write to each of several servos by a packet of its own, at once and whatever is under way.
-
-        Nobody answers, nothing is listened to before, and one servo's packet does not hang on another's: what
-        is sent may collide with a reply, so send more than one copy where it matters. Raises LineLost.
-        """
-        packets = b"".join(group_write_packet([part]) for part in parts)
-        try:
-            self.port.send_now(copies * packets)
-        except LineLost as error:
-            raise self.placed(error, [part.servo_id for part in parts], "group write") from error
 
     def _replies(
         self, question: GroupQuestion, sent_s: float
@@ -288,5 +238,5 @@ def _same(one: bytes | Refused, other: bytes | Refused) -> bool:
 
 
 def _behind(waited: list[int], servo_id: int) -> list[int]:
-    """Who is still waited for after a servo has spoken: those behind it in the list."""
+    """The servos whose replies are still to come after one has spoken: those behind it in the list."""
     return waited[waited.index(servo_id) + 1 :] if servo_id in waited else waited

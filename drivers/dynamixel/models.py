@@ -64,7 +64,7 @@ OPERATING_MODES = MappingProxyType(
     }
 )
 
-Words = Callable[["ServoModel", int], str]
+Meaning = Callable[["ServoModel", int], str]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,8 +75,6 @@ class ServoModel(CountedModel):
     ----------
     most_current_counts
         The most that its current limit may be; 0 for a servo that measures its load only.
-    watchdog_firmware
-        The first firmware that has a bus watchdog.
     """
 
     number: int
@@ -190,23 +188,23 @@ def what_is_needed(number: int) -> str:
             f"the model number {number}, nor do the tables of the installed dynamixel-sdk: needed is a "
             "dynamixel-sdk that holds its .model table"
         )
-    words = f"the {theirs} (model number {number}); mastctl rig servo info reads it"
+    servo = f"the {theirs} (model number {number}); mastctl rig servo info reads it"
     if theirs.startswith("ym"):
-        return f"{words}. It needs registers laid out as those of X or P, which the Y family's are not"
-    return f"{words}. Needed is a row in drivers/dynamixel/models.py: its unit of current and its backlash"
+        return f"{servo}. It needs registers laid out as those of X or P, which the Y family's are not"
+    return f"{servo}. Needed is a row in drivers/dynamixel/models.py: its unit of current and its backlash"
 
 
-def hardware_error_words(value: int) -> list[str]:
-    """Return what a hardware-error register says, in plain words."""
-    words = [word for bit, word in HARDWARE_ERRORS.items() if value & bit]
+def hardware_error_names(value: int) -> list[str]:
+    """Return the errors in a hardware-error register."""
+    names = [name for bit, name in HARDWARE_ERRORS.items() if value & bit]
     unknown = value & ~sum(HARDWARE_ERRORS)
-    return words + ([f"unknown hardware error bits 0x{unknown:02x}"] if unknown else [])
+    return names + ([f"unknown hardware error bits 0x{unknown:02x}"] if unknown else [])
 
 
-def register_words(model: ServoModel, name: str, value: int) -> str:
+def register_meaning(model: ServoModel, name: str, value: int) -> str:
     """Return what a register's number means; empty where the number says it."""
-    words = _WORDS.get(name)
-    return "" if words is None else words(model, value)
+    meaning = _MEANINGS.get(name)
+    return "" if meaning is None else meaning(model, value)
 
 
 def _angle(model: ServoModel, value: int) -> str:
@@ -234,10 +232,10 @@ def _volts(model: ServoModel, value: int) -> str:
 
 
 def _errors(model: ServoModel, value: int) -> str:
-    return ", ".join(hardware_error_words(value)) or "none"
+    return ", ".join(hardware_error_names(value)) or "none"
 
 
-_WORDS: Mapping[str, Words] = {
+_MEANINGS: Mapping[str, Meaning] = {
     "model_number": lambda model, value: model.name,
     "baud": lambda model, value: f"{BAUD_RATES[value]} baud" if value in BAUD_RATES else "unknown baud rate",
     "return_delay": lambda model, value: f"{2 * value} us",

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 from drivers.dynamixel.models import TICK_ADDRESSES
 from drivers.errors import DriverError
-from drivers.servo_bus.port import StatusPacket
+from drivers.servo_bus.port import Part, StatusPacket, at_header
 
 HEADER = b"\xff\xff\xfd\x00"
 START = b"\xff\xff\xfd"
@@ -26,7 +27,7 @@ PING, READ, WRITE, REBOOT, STATUS = 0x01, 0x02, 0x03, 0x08, 0x55
 SYNC_READ, SYNC_WRITE, BULK_READ, BULK_WRITE = 0x82, 0x83, 0x92, 0x93
 
 # E-manual, protocol 2.0, the error field of a status packet.
-ERROR_WORDS = {
+REFUSALS = {
     1: "it could not process the instruction",
     2: "it does not know the instruction",
     3: "the instruction's checksum did not fit",
@@ -73,18 +74,12 @@ def take_status(buffer: bytearray, *, at_end: bool = False) -> StatusPacket | No
 
     Parameters
     ----------
-    buffer
-        Bytes as they came in; what was used or dropped is removed.
     at_end
         No more bytes will come: a header whose packet is not whole was noise, look behind it.
     """
     while True:
-        start = buffer.find(HEADER)
-        if start < 0:
-            del buffer[: max(0, len(buffer) - len(HEADER) + 1)]
+        if not at_header(buffer, HEADER):
             return None
-        if start:
-            del buffer[:start]
         if len(buffer) < 7:
             if not at_end:
                 return None
@@ -108,21 +103,6 @@ def take_status(buffer: bytearray, *, at_end: bool = False) -> StatusPacket | No
 
 
 @dataclass(frozen=True)
-class Part:
-    """What is read of, or written to, one servo in a group: the address, and length or data."""
-
-    servo_id: int
-    address: int
-    length: int
-    data: bytes = b""
-
-    @property
-    def place(self) -> bytes:
-        """Address and length as packets hold them."""
-        return self.address.to_bytes(2, "little") + self.length.to_bytes(2, "little")
-
-
-@dataclass(frozen=True)
 class GroupAnswer:
     """The replies to a group read: by id what came, and why the rest did not.
 
@@ -137,7 +117,7 @@ class GroupAnswer:
 
 @dataclass(frozen=True)
 class GroupQuestion:
-    """A group read as it is sent and what it is to be answered; kept, since most are asked again and again.
+    """A group read as it is sent, and what its answer is to be.
 
     ``ticks`` are the places of the servos' counters in the blocks of those that have them there, by id.
     """
@@ -154,31 +134,36 @@ def tick_at(address: int, length: int) -> int | None:
     return next(ticks, None)
 
 
+@lru_cache(maxsize=64)  # most are made again and again
 def group_question(parts: Sequence[Part]) -> GroupQuestion:
     """Return a group read: Sync Read where all blocks are alike, else Bulk Read."""
-    ids = {part.servo_id: bytes((part.servo_id,)) for part in parts}
     if _alike(parts):
         instruction = SYNC_READ
-        body = parts[0].place + b"".join(ids.values())
+        body = _place(parts[0]) + bytes(part.servo_id for part in parts)
     else:
         instruction = BULK_READ
-        body = b"".join(ids[part.servo_id] + part.place for part in parts)
-    places = {part.servo_id: tick_at(part.address, part.length) for part in parts}
+        body = b"".join(bytes((part.servo_id,)) + _place(part) for part in parts)
+    ticks = {part.servo_id: tick_at(part.address, part.length) for part in parts}
     return GroupQuestion(
         instruction_packet(BROADCAST_ID, instruction, body),
         sum(11 + part.length for part in parts),
         {part.servo_id: part for part in parts},
-        {servo_id: at for servo_id, at in places.items() if at is not None},
+        {servo_id: at for servo_id, at in ticks.items() if at is not None},
     )
 
 
 def group_write_packet(parts: Sequence[Part]) -> bytes:
     """Return a write to several servos: Sync Write where all blocks are alike, else Bulk Write."""
     if _alike(parts):
-        body = parts[0].place + b"".join(bytes((part.servo_id,)) + part.data for part in parts)
+        body = _place(parts[0]) + b"".join(bytes((part.servo_id,)) + part.data for part in parts)
         return instruction_packet(BROADCAST_ID, SYNC_WRITE, body)
-    body = b"".join(bytes((part.servo_id,)) + part.place + part.data for part in parts)
+    body = b"".join(bytes((part.servo_id,)) + _place(part) + part.data for part in parts)
     return instruction_packet(BROADCAST_ID, BULK_WRITE, body)
+
+
+def _place(part: Part) -> bytes:
+    """Address and length as packets hold them."""
+    return part.address.to_bytes(2, "little") + part.length.to_bytes(2, "little")
 
 
 def _alike(parts: Sequence[Part]) -> bool:

@@ -17,6 +17,8 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
+from drivers.servo_bus.port import Register
+
 _NAMES = {
     "Firmware Version": "firmware",
     "Baud Rate": "baud",
@@ -41,7 +43,7 @@ _KNOWN = """
 """The registers that the driver uses, with a minus in front of those that may be below zero."""
 
 # A reply does not say which register it is of, but its length does if no two have the same one: here only
-# torque and goal PWM, and shutdown and bus watchdog, which are never asked for one after the other. Each
+# torque and goal PWM, and shutdown and bus watchdog, which are never read one after the other. Each
 # window holds registers only that every servo of the table has, without gaps, which servos may refuse. The
 # registers around the counter (realtime_tick) are read together with it.
 _WINDOWS = {
@@ -60,20 +62,17 @@ _WINDOWS = {
 
 
 @dataclass(frozen=True)
-class ControlItem:
-    """One entry of a control table: its address, its size in bytes, whether it is signed.
+class ControlItem(Register):
+    """One entry of a control table, little-endian.
 
     ``window`` is the address and the length of what is read to know the register: see `_WINDOWS`.
     """
 
-    name: str
-    address: int
-    size: int
     signed: bool = False
     window: tuple[int, int] = (0, 0)
 
     def decode(self, data: bytes) -> int:
-        """Return the value of the register's little-endian bytes."""
+        """Return its value, as `Register`."""
         return int.from_bytes(data, "little", signed=self.signed)
 
     def decode_window(self, data: bytes) -> int:
@@ -82,7 +81,7 @@ class ControlItem:
         return self.decode(data[at : at + self.size])
 
     def encode(self, value: int) -> bytes:
-        """Return a value as the register's little-endian bytes; OverflowError if it does not fit."""
+        """Return its bytes, as `Register`."""
         return value.to_bytes(self.size, "little", signed=self.signed)
 
 

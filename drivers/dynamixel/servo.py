@@ -1,4 +1,4 @@
-"""One servo made ready: who it is, what is in its way, its settings checked and set, without moving it.
+"""One servo made ready: its model, what is in its way, its settings checked and set, without moving it.
 
 Permanent settings are written only where they differ (they wear) and only while torque is off (the servo
 locks them). Everything written is read back, and nothing is decided by an answer that could be another
@@ -9,24 +9,26 @@ from __future__ import annotations
 
 import itertools
 import logging
+from collections.abc import Mapping
 
-from drivers.dynamixel.link import Link
+from drivers.dynamixel.link import Link, Pinged
 from drivers.dynamixel.models import (
     HARDWARE_ERRORS,
     MODELS_BY_NUMBER,
     NO_SECONDARY_ID,
     POSITION_MODE,
-    hardware_error_words,
+    WATCHDOG_TRIPPED,
+    hardware_error_names,
     what_is_needed,
 )
-from drivers.dynamixel.packets import Part
-from drivers.dynamixel.registers import RegisterBlock
-from drivers.dynamixel.servo_table import ServoTable, identified
+from drivers.dynamixel.packets import GroupAnswer
+from drivers.dynamixel.registers import ControlItem, RegisterBlock
 from drivers.dynamixel.settings import DynamixelAxisSettings, DynamixelSettings
 from drivers.errors import BadReply, DriverError, HardwareFault, NoReply, Refused, WrongDevice
-from drivers.servo_bus.course import ServoSample, Truth
-from drivers.servo_bus.exchange import again
-from drivers.servo_bus.rest import come_to_rest
+from drivers.servo_bus.course import ServoSample
+from drivers.servo_bus.exchange import ATTEMPTS, LATE_S, again
+from drivers.servo_bus.port import QUIET_S, Part
+from drivers.servo_bus.servo import BusServo
 
 log = logging.getLogger(__name__)
 
@@ -36,6 +38,7 @@ FULL_STATUS_RETURN = 2
 REVERSE_BIT, SLAVE_BIT = 0x01, 0x02
 HOMING_LIMIT = 1024  # what position mode honours of an X servo's homing offset, counts
 REBOOT_S = 2.0  # how long a servo may be deaf after a reboot
+PROFILE = ("profile_acceleration", "profile_velocity")
 
 
 def motion_blocks(settings: DynamixelAxisSettings) -> tuple[RegisterBlock, ...]:
@@ -66,41 +69,102 @@ class Reboots:
         self._times_s.append(now_s)
 
 
-def hardware_fault_words(name: str, error: int) -> str:
+def hardware_fault(name: str, error: int) -> str:
     """Return one sentence for a hardware error."""
-    words = " and ".join(hardware_error_words(error & sum(HARDWARE_ERRORS)) or [f"bits 0x{error:02x}"])
+    errors = " and ".join(hardware_error_names(error & sum(HARDWARE_ERRORS)) or [f"bits 0x{error:02x}"])
     return (
-        f"{name} reports {words} (hardware error 0x{error:02x}); it keeps saying so until it is rebooted or "
+        f"{name} reports {errors} (hardware error 0x{error:02x}); it keeps saying so until it is rebooted or "
         "switched off and on, which drops its torque"
     )
 
 
-class Servo(ServoTable):
-    """One configured servo on an open line.
+def identified(link: Link, servo_id: int, name: str) -> Pinged:
+    """Return what a servo says to a ping, twice in a row and around a silence; it may answer nothing else
+    yet.
 
-    Parameters
-    ----------
-    axis
-        ``pan`` or ``tilt``, for messages.
+    Raises BadReply if it says another thing each time; NoReply, LineLost.
     """
+    before = again(link, lambda: link.ping(servo_id))
+    for _ in range(ATTEMPTS):
+        link.quiet(QUIET_S)
+        now = again(link, lambda: link.ping(servo_id))
+        if now == before:
+            return now
+        before = now
+    raise BadReply(f"{name} says another thing about itself in each answer")
+
+
+class ServoTable:
+    """The control table of one servo: read, set and seen to hold, requested again where a reply was lost."""
+
+    def __init__(self, link: Link, servo_id: int, registers: Mapping[str, ControlItem], name: str) -> None:
+        self.name = name
+        self.servo_id = servo_id
+        self._link = link
+        self._registers = registers
+
+    def get(self, register: str) -> int:
+        """Return a register's value. Raises as `Link.proven`."""
+        return self.get_all(register)[register]
+
+    def get_all(self, *registers: str) -> dict[str, int]:
+        """Return several registers' values by name, as `get` does one, at the cost of one."""
+        entries = [self._registers[register] for register in registers]
+        values = again(self._link, lambda: self._link.proven(self.servo_id, *entries))
+        return dict(zip(registers, values, strict=True))
+
+    def write(self, register: str, value: int) -> None:
+        """Set a register, again where the reply was lost, which is the same. Raises as `Link.write`."""
+        again(self._link, lambda: self._link.write(self.servo_id, self._registers[register], value))
+
+    def set(self, register: str, value: int) -> None:
+        """Set a register and see that it holds the value.
+
+        Raises WrongDevice if the servo says that it did but holds another value; Refused, NoReply, BadReply,
+        LineLost.
+        """
+        refused: Refused | None = None
+        for _ in range(ATTEMPTS):
+            try:
+                self.write(register, value)
+            except Refused as error:
+                if refused is not None:
+                    raise
+                refused = error  # it may be that of another write
+            stored = self.get(register)
+            if stored == value:
+                return
+            self._link.quiet(LATE_S if refused is None else QUIET_S)
+        raise WrongDevice(f"{self.name} holds {stored} in {register} after {value} was written to it")
+
+    def block(self, block: RegisterBlock) -> GroupAnswer:
+        """Return neighbouring registers, requested one time; raises as `Link.block`."""
+        return self._link.block(Part(self.servo_id, block.address, block.length))
+
+
+class Servo(ServoTable, BusServo):
+    """One configured servo on an open line, as `BusServo`."""
+
+    _link: Link
+    _registers: Mapping[str, ControlItem]
+    _settings: DynamixelAxisSettings
+    _head: DynamixelSettings
 
     def __init__(
-        self, link: Link, axis: str, settings: DynamixelAxisSettings, head: DynamixelSettings
+        self,
+        link: Link,
+        axis: str,
+        settings: DynamixelAxisSettings,
+        head: DynamixelSettings,
+        reboots: Reboots,
     ) -> None:
-        name = f"{axis} (servo {settings.servo_id})"
-        super().__init__(link, settings.servo_id, settings.model.registers, name)
-        self._settings = settings
-        self._head = head
-        self.truth = Truth(name, settings)
-        self.dropped = False  # its torque, by us, and not yet taken hold again
+        BusServo.__init__(self, link, axis, settings, head)
+        ServoTable.__init__(self, link, settings.servo_id, settings.model.registers, self.name)
+        self._reboots = reboots
         self._blocks = itertools.cycle(motion_blocks(settings))
 
     def check_identity(self) -> None:
-        """See that the servo is the one configured, and that it answers every instruction.
-
-        Raises WrongDevice for another model, or a firmware without a bus watchdog where one is configured;
-        NoReply, LineLost.
-        """
+        """As `BusServo`; also that its firmware has a bus watchdog where one is configured."""
         model = self._settings.model
         number, firmware = self._model_and_firmware()
         if number != model.number:
@@ -117,57 +181,63 @@ class Servo(ServoTable):
             )
         level = self._registers["status_return_level"]
         try:
-            answering = self._link.proven(self._servo_id, level) == [FULL_STATUS_RETURN]
+            answering = self._link.proven(self.servo_id, level) == [FULL_STATUS_RETURN]
         except NoReply:
             answering = False
         if not answering:
-            self._link.write_unanswered(self._servo_id, level, FULL_STATUS_RETURN)
+            self._link.write_unanswered(self.servo_id, level, FULL_STATUS_RETURN)
 
     def _model_and_firmware(self) -> tuple[int, int]:
-        """Who it is, by its registers; only who does not answer that is asked by a ping.
+        """Its model and firmware, by its registers; only a servo that does not answer that is pinged.
 
         A ping's reply is as long as one that holds the hardware error: it is not to be under way then.
         """
         try:
             stored = self.get_all("model_number", "firmware")
         except (NoReply, Refused):
-            pinged = identified(self._link, self._servo_id, self.name)
+            pinged = identified(self._link, self.servo_id, self.name)
             return pinged.model_number, pinged.firmware
         return stored["model_number"], stored["firmware"]
 
     def stand(self) -> None:
         """Make where the servo is its goal, if it is of the model configured and its torque is on.
 
-        Asked one time and not read back: whatever it is, another axis may wait for the same. Raises NoReply,
-        BadReply, Refused, LineLost.
+        Requested one time and not read back: whatever it is, another axis may wait for the same.
         """
         registers = self._registers
         requested = (registers["model_number"], registers["torque_enable"])
-        if self._link.proven(self._servo_id, *requested) != [self._settings.model.number, 1]:
+        if self._link.proven(self.servo_id, *requested) != [self._settings.model.number, 1]:
             return
-        low, high = self._settings.limit_counts
-        goal = min(max(self.look_once().counts, low), high)
-        self._link.write(self._servo_id, registers["goal_position"], goal)
+        goal = self._settings.within_limits(self.sample_once().counts)
+        self._link.write(self.servo_id, registers["goal_position"], goal)
 
-    def check_health(self, reboots: Reboots) -> None:
-        """See that the servo reports no hardware error; restart it if the configuration says so.
+    def stood(self) -> str:
+        """Have the servo stand, unless its watchdog has stopped it; as `BusServo.stood`."""
+        if self.get("bus_watchdog") == WATCHDOG_TRIPPED:
+            return "was stopped by its watchdog"
+        if not self.get("torque_enable"):
+            return "has its torque off"
+        self.stand()
+        return "was commanded to stand where it is, and holds"
 
-        A restart drops the torque, so it is not done again and again while what is wrong goes on. Raises
-        HardwareFault.
+    def check_health(self) -> None:
+        """As `BusServo`; restarts it if the configuration says so.
+
+        A restart drops the torque, so it is not done again and again while what is wrong goes on.
         """
         error = self.get("hardware_error")
         now_s = self._link.clock.now_s()
-        if error and self._settings.on_hardware_error == "reboot" and reboots.left(now_s):
-            log.warning("%s: %s; rebooting it", self.name, ", ".join(hardware_error_words(error)))
-            reboots.note(now_s)
+        if error and self._settings.on_hardware_error == "reboot" and self._reboots.left(now_s):
+            log.warning("%s: %s; rebooting it", self.name, ", ".join(hardware_error_names(error)))
+            self._reboots.note(now_s)
             self.reboot()
             error = self.get("hardware_error")
         if error:
-            raise HardwareFault(hardware_fault_words(self.name, error), detail={"hardware_error": error})
+            raise HardwareFault(hardware_fault(self.name, error), detail={"hardware_error": error})
 
     def reboot(self) -> None:
         """Restart the servo and wait until it answers; torque drops. Raises NoReply, LineLost."""
-        self._link.reboot(self._servo_id)
+        self._link.reboot(self.servo_id)
         self.truth.forget()
         until_s = self._link.clock.now_s() + REBOOT_S
         while True:
@@ -178,53 +248,25 @@ class Servo(ServoTable):
                 if self._link.clock.now_s() > until_s:
                     raise
 
-    def look(self) -> ServoSample:
-        """Return what the servo says about its motion now; what was lost is asked for again.
-
-        Raises NoReply, BadReply, Refused, LineLost.
-        """
-        return again(self._link, self.look_once)
-
-    def look_once(self) -> ServoSample:
-        """Return what the servo says about its motion now, asked one time; raises as `look`."""
+    def sample_once(self) -> ServoSample:
+        """Return what the servo says about its motion now, requested one time."""
         block = next(self._blocks)
         answer = self.block(block)
-        status = answer.statuses[self._servo_id]
+        status = answer.statuses[self.servo_id]
         sample = ServoSample(block.decode(status.data), status.alert, answer.sent_s, answer.received_s)
         self.truth.check(sample)
         return sample
 
-    def check_place(self) -> int:
-        """Return the count that may be the axis' goal where it stands, as
-        `ServoAxisSettings.goal_at_place`."""
-        return self._settings.goal_at_place(self.name, self.look().counts)
-
     def set_up(self) -> None:
-        """Bring the servo's permanent settings to what the configuration says.
-
-        The torque may be off then: `take_hold` follows, or the pair has it hold again. Raises WrongDevice if
-        a setting cannot be used, or must change while torque may not be dropped; Refused if the servo refuses
-        a value.
-        """
+        """As `BusServo`; first its profile."""
+        self.set_profile()  # refused, if at all, before the torque is touched
         wanted = self._wanted()
         stored = self.get_all(*wanted)
-        different = {name: value for name, value in wanted.items() if stored[name] != value}
-        if not different:
-            return
-        changes = ", ".join(f"{name} {value}" for name, value in different.items())
-        torque = self.get("torque_enable")
-        if torque:
-            if not self._head.torque_off_at_start:
-                raise WrongDevice(
-                    f"{self.name} must be set to {changes}, which it takes only with torque off, but torque "
-                    "is on and the axis may fall. Support it and set torque_off_at_start: true, or switch "
-                    "the servo off and on"
-                )
-            self.dropped = True
-            self.set("torque_enable", 0)
-        log.info("%s: setting %s", self.name, changes)
-        for name in sorted(different, key=lambda n: n != "operating_mode"):  # a new mode resets others
-            self.set(name, different[name])
+        self._change({name: value for name, value in wanted.items() if stored[name] != value})
+
+    def _set_permanent(self, values: Mapping[str, int]) -> None:
+        for name in sorted(values, key=lambda n: n != "operating_mode"):  # a new mode resets others
+            self.set(name, values[name])
 
     def _wanted(self) -> dict[str, int]:
         """The permanent settings, by register."""
@@ -256,42 +298,21 @@ class Servo(ServoTable):
             wanted["current_limit"] = round(settings.current_limit_A / model.current_unit_A)
         return wanted
 
-    def take_hold(self) -> int:
-        """Switch torque on where the axis stands, with the profile set; returns the goal, counts.
-
-        An old goal is void: the present position is the goal before anything can move. A watchdog that has
-        tripped is cleared here, which makes this the deliberate act of arming anew.
-        """
+    def _aim_at_place(self) -> bool:
+        """Clear a watchdog that has tripped too: to take hold is the deliberate act of arming anew."""
         stored = self.get_all("torque_enable", "bus_watchdog")
-        torque, tripped = bool(stored["torque_enable"]), stored["bus_watchdog"] != 0
         counts = self.check_place()
-        if tripped:
-            self.clear_watchdog(counts)
+        if stored["bus_watchdog"]:  # cleared, it may go on to its old goal: void in the same moment
+            self._link.write_at_once([self.part("bus_watchdog", 0), self.part("goal_position", counts)])
+            self.set("bus_watchdog", 0)
         self.set("goal_position", counts)
         self._full_strength()
         self.set_profile()
-        if not torque:
-            counts = self.check_place()
-            self.set("goal_position", counts)
-            try:
-                self.set("torque_enable", 1)
-            except WrongDevice:
-                raise HardwareFault(
-                    f"{self.name} does not switch its torque on; it may be shut down by a hardware error"
-                ) from None
-        self.dropped = False
-        return come_to_rest(self.look, self.set, self._settings.limit_counts, self._link.clock)
-
-    @property
-    def profile(self) -> tuple[int, int]:
-        """Profile acceleration and velocity, as `set_profile` sets them."""
-        settings, head = self._settings, self._head
-        acceleration = settings.acceleration_counts(head.acceleration_rad_per_s2)
-        return acceleration, settings.velocity_counts(head.speed_rad_per_s)
+        return bool(stored["torque_enable"])
 
     def set_profile(self) -> None:
         """Set how fast the servo turns and brakes; raises as `set`, and WrongDevice where it cannot."""
-        for name, value in zip(("profile_acceleration", "profile_velocity"), self.profile, strict=True):
+        for name, value in zip(PROFILE, self.profile, strict=True):
             try:
                 self.set(name, value)
             except Refused as error:
@@ -300,16 +321,13 @@ class Servo(ServoTable):
                     f"speed_rad_per_s is more than its own limits allow ({error})"
                 ) from error
 
+    def leg(self, profile: tuple[int, int], goal: int) -> Part:
+        """Return a goal with its profile, as `BusServo.leg`."""
+        return self.neighbours(dict(zip((*PROFILE, "goal_position"), (*profile, goal), strict=True)))
+
     def send_leg(self, profile: tuple[int, int], goal: int) -> None:
         """Set a goal, with the profile that leads there in the same packet; raises as `set`."""
-        parts = [
-            self.part(name, value)
-            for name, value in zip(
-                ("profile_acceleration", "profile_velocity", "goal_position"), (*profile, goal), strict=True
-            )
-        ]
-        data = b"".join(part.data for part in parts)
-        self._link.group_write([Part(parts[0].servo_id, parts[0].address, len(data), data)])
+        self._link.group_write([self.leg(profile, goal)])
         self.set("goal_position", goal)
 
     def _full_strength(self) -> None:
@@ -325,10 +343,7 @@ class Servo(ServoTable):
 
     def release(self, limp: bool) -> None:
         """Switch the watchdog off, and the torque if it is to be ``limp``; for the end."""
-        for register in (
-            "bus_watchdog",
-            *(("torque_enable",) if limp else ()),
-        ):
+        for register in ("bus_watchdog", "torque_enable")[: 1 + limp]:
             try:
                 self.set(register, 0)
             except DriverError as error:

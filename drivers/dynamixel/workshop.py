@@ -5,51 +5,34 @@ For one thread and a line that no daemon holds. Nothing here moves a servo.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
 
-from drivers.clock import Clock
 from drivers.dynamixel.link import Link, Pinged
 from drivers.dynamixel.models import (
     BAUD_RATES,
     MODELS,
     MODELS_BY_NUMBER,
     ServoModel,
-    hardware_error_words,
-    register_words,
+    hardware_error_names,
+    register_meaning,
     what_is_needed,
 )
 from drivers.dynamixel.registers import vendor_names, vendor_registers
-from drivers.dynamixel.servo_table import ServoTable, identified
+from drivers.dynamixel.servo import ServoTable, identified
 from drivers.dynamixel.settings import POLL_BYTES
 from drivers.errors import NoReply, Refused, WrongDevice
-from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.bench import (
     FoundServo,
-    Scan,
     ServoBench,
     ServoFacts,
     changing,
     check_change,
-    scanned,
 )
 from drivers.servo_bus.exchange import again
 
 
-def scan(
-    port: str,
-    bauds: Sequence[int],
-    reply_timeout_s: float,
-    clock: Clock | None = None,
-    open_line: OpenLine = SerialLine,
-) -> Scan:
-    """Ask at every baud rate who is there, as `scanned`; the rest as of `Link`."""
-    opened = partial(Link, port, reply_timeout_s=reply_timeout_s, clock=clock, open_line=open_line)
-    return scanned(bauds, opened, _there)
-
-
-def _there(link: Link) -> tuple[list[FoundServo], int]:
+def _present(link: Link) -> tuple[list[FoundServo], int]:
     link.find_echo()
     pings, noise = link.ping_all()
     return [_found(link, ping) for ping in pings], noise
@@ -57,11 +40,11 @@ def _there(link: Link) -> tuple[list[FoundServo], int]:
 
 def _found(link: Link, ping: Pinged) -> FoundServo:
     model = MODELS_BY_NUMBER.get(ping.model_number)
-    words: list[str] = []
+    errors: list[str] = []
     if ping.alert and model is not None:
-        words = hardware_error_words(table_of(link, ping.servo_id, model).get("hardware_error"))
+        errors = hardware_error_names(table_of(link, ping.servo_id, model).get("hardware_error"))
     name = model.name if model else vendor_names().get(ping.model_number, "unknown")
-    return FoundServo(link.baud, ping.servo_id, ping.model_number, name, ping.firmware, tuple(words))
+    return FoundServo(link.baud, ping.servo_id, ping.model_number, name, ping.firmware, tuple(errors))
 
 
 def facts(link: Link, servo_id: int) -> ServoFacts:
@@ -78,8 +61,8 @@ def facts(link: Link, servo_id: int) -> ServoFacts:
     for name in model.registers:
         with suppress(Refused):  # this model has none
             values[name] = table.get(name)
-    words = {name: register_words(model, name, value) for name, value in values.items()}
-    return ServoFacts(servo_id, model.name, firmware, values, {n: w for n, w in words.items() if w})
+    meanings = {name: register_meaning(model, name, value) for name, value in values.items()}
+    return ServoFacts(servo_id, model.name, firmware, values, {n: m for n, m in meanings.items() if m})
 
 
 def _vendor_facts(link: Link, pinged: Pinged) -> ServoFacts:
@@ -90,9 +73,9 @@ def _vendor_facts(link: Link, pinged: Pinged) -> ServoFacts:
     values: dict[str, int] = {}
     for register in vendor_registers(pinged.model_number):
         changing = register.name.startswith(("present_", "realtime_", "moving")) or "traj" in register.name
-        ask = partial(link.heard if changing else link.agreed, pinged.servo_id, register)
+        read = partial(link.read_once if changing else link.agreed, pinged.servo_id, register)
         with suppress(Refused):  # this firmware has none
-            values[register.name] = again(link, ask)
+            values[register.name] = again(link, read)
     name = vendor_names()[pinged.model_number]
     return ServoFacts(pinged.servo_id, name, pinged.firmware, values, {})
 
@@ -107,8 +90,8 @@ def _known(pinged: Pinged) -> ServoModel:
     """The model of a servo. Raises WrongDevice."""
     model = MODELS_BY_NUMBER.get(pinged.model_number)
     if model is None:
-        words = what_is_needed(pinged.model_number)
-        raise WrongDevice(f"servo {pinged.servo_id}: the driver does not know {words}")
+        needed = what_is_needed(pinged.model_number)
+        raise WrongDevice(f"servo {pinged.servo_id}: the driver does not know {needed}")
     return model
 
 
@@ -118,7 +101,7 @@ def table_of(link: Link, servo_id: int, model: ServoModel) -> ServoTable:
 
 
 def set_id(link: Link, old: int, new: int, new_baud: int | None = None, *, torque_off: bool = False) -> None:
-    """Give a servo another id, and another baud rate if asked; see that it took them.
+    """Give a servo another id, and another baud rate if wanted; see that it took them.
 
     A change that is broken off says what the servo is left with. Connect that one servo alone if two may have
     the same id: they would both take the new one. Raises BadOptions for ids or a baud rate that cannot be;
@@ -176,7 +159,7 @@ def _confirm(link: Link, servo_id: int, model: ServoModel, otherwise: str) -> No
 
 
 BENCH = ServoBench(
-    "dynamixel", Link, scan, facts, set_id,
+    "dynamixel", Link, _present, facts, set_id,
     (57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000, 4_500_000, 6_000_000, 10_500_000, 9600),
     (1_000_000, 57_600, 115_200, 2_000_000, 3_000_000, 4_000_000),
     MODELS, "XL330-M288-T", POLL_BYTES,

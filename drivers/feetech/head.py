@@ -11,16 +11,17 @@ for them alone. Everything written is read back. The offset in the EEPROM is rep
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, WithJsonSchema, model_validator
 
 from calib.files.records import ABSENT, problem
 from drivers.clock import Clock
-from drivers.errors import BadReply, DriverError, HardwareFault, NoReply, WrongDevice
+from drivers.errors import DriverError, HardwareFault, NoReply, WrongDevice
 from drivers.feetech.servos import (
     BAUD_RATES,
     LOCKED,
@@ -34,21 +35,20 @@ from drivers.feetech.servos import (
     Questions,
     facts,
     model_named,
-    open_link,
-    scan,
+    present,
     set_id,
-    status_words,
+    status_faults,
 )
 from drivers.options import one_of, read_options
 from drivers.registry import Driver
-from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.bench import ServoBench
-from drivers.servo_bus.course import ServoSample, Truth
+from drivers.servo_bus.course import ServoSample
 from drivers.servo_bus.exchange import ATTEMPTS, again
 from drivers.servo_bus.head import BusHead
-from drivers.servo_bus.pair import BRAKE_COPIES, ServoAxis, ServoPair, SessionWatch
-from drivers.servo_bus.rest import come_to_rest, halt_axes
-from drivers.servo_bus.session import GivenUp
+from drivers.servo_bus.pair import ServoAxis, ServoPair, SessionWatch
+from drivers.servo_bus.port import Part
+from drivers.servo_bus.servo import BusServo
+from drivers.servo_bus.session import distrusted
 from drivers.servo_bus.settings import (
     HeadSettings,
     ServoAxisSettings,
@@ -104,7 +104,7 @@ class FeetechSettings(HeadSettings):
 
     @model_validator(mode="after")
     def _check_lease(self) -> Self:
-        if self.pan.model.order != self.tilt.model.order:
+        if self.pan.model.is_scs != self.tilt.model.is_scs:
             raise problem("pan.model", "it is of another series than tilt.model; one on a bus is expected")
         self._set_patience("lease_s", USUAL_LEASE_S, SHORTEST_LEASE_S)
         return self
@@ -118,24 +118,22 @@ class FeetechSettings(HeadSettings):
 feetech_settings = partial(read_options, FeetechSettings)
 """Return the head that the options of ``driver: feetech`` describe. Raises BadOptions."""
 
-LEAST_TORQUE = 20  # room below a torque limit for the tokens of the questions
+LEAST_TORQUE = 20  # space below a torque limit for the tokens of the questions
 
 
-class FeetechServo:
-    """One configured servo on an open line.
+@dataclass(frozen=True)
+class FeetechMemory:
+    """What outlasts a line of the head: questions, and the offset in each EEPROM as found first, by id."""
 
-    Parameters
-    ----------
-    axis
-        ``pan`` or ``tilt``, for messages.
-    offsets
-        The offset in each servo's EEPROM as it was found first, by id; outlasts a line of the head.
+    questions: Questions = field(default_factory=Questions)
+    offsets: dict[int, int] = field(default_factory=dict)
 
-    Attributes
-    ----------
-    torque_limit
-        As much as its motor may be driven, 0.1 %.
-    """
+
+class FeetechServo(BusServo):
+    """One configured servo on an open line, as `BusServo`."""
+
+    _link: FeetechLink
+    _settings: FeetechAxisSettings
 
     def __init__(
         self,
@@ -143,43 +141,32 @@ class FeetechServo:
         axis: str,
         settings: FeetechAxisSettings,
         head: FeetechSettings,
-        offsets: dict[int, int],
+        memory: FeetechMemory,
     ) -> None:
-        self.name = f"{axis} (servo {settings.servo_id})"
-        self.servo_id = settings.servo_id
+        super().__init__(link, axis, settings, head)
         self.torque_limit = 0
-        self._link = link
-        self._settings = settings
-        self._head = head
-        self._offsets = offsets
-        self._registers = settings.model.registers
-        self.truth = Truth(self.name, settings)
-        self.dropped = False
+        self._offsets = memory.offsets
 
     def get(self, register: str) -> int:
-        """Return a register's value; a lost reply is asked for again. Raises as `FeetechLink.proven`."""
-        entry, model = self._registers[register], self._settings.model
-        return again(self._link, lambda: self._link.proven(self.servo_id, entry, model))
+        """Return a register's value; a lost reply is requested again. Raises as `FeetechLink.proven`."""
+        entry = self._registers[register]
+        return again(self._link, lambda: self._link.proven(self.servo_id, entry))
 
     def set(self, register: str, value: int) -> None:
         """Set a register and see that it holds the value.
 
         Raises WrongDevice if the servo says that it did but holds another value; NoReply, BadReply, LineLost.
         """
-        entry, model = self._registers[register], self._settings.model
+        entry = self._registers[register]
         for _ in range(ATTEMPTS):
-            again(self._link, lambda: self._link.write(self.servo_id, entry, value, model))
+            again(self._link, lambda: self._link.write(self.servo_id, entry, value))
             stored = self.get(register)
             if stored == value:
                 return
         raise WrongDevice(f"{self.name} holds {stored} in {register} after {value} was written to it")
 
     def check_identity(self) -> None:
-        """See that the servo is the one configured, and that it answers every instruction.
-
-        Raises WrongDevice for another model, and an offset that was changed since the head was opened;
-        NoReply, LineLost.
-        """
+        """As `BusServo`; also that its offset is as it was when the head was opened."""
         model = self._settings.model
         number = self.get("model_number")
         if model.number is not None and number != model.number:
@@ -191,7 +178,8 @@ class FeetechServo:
                 "table is named by its series: STS, SMS or SCS"
             )
         if self.get("response_level") != 1:
-            self._unlocked({"response_level": 1}, answered=False)
+            with self._unlocked(answers=False):
+                self._link.write_unanswered(self.servo_id, self._registers["response_level"], 1)
         if "offset" not in self._registers:
             return
         offset = self.get("offset")
@@ -202,12 +190,12 @@ class FeetechServo:
             log.warning("%s has an offset of %d counts in its EEPROM; it is left as it is", self.name, offset)
 
     def check_health(self) -> None:
-        """See that the servo reports no fault. Raises HardwareFault."""
+        """As `BusServo`."""
         if error := again(self._link, lambda: self._link.ping(self.servo_id)):
-            raise HardwareFault(fault_words(self.name, error), detail={"status": error})
+            raise HardwareFault(status_fault(self.name, error), detail={"status": error})
 
-    def sample(self) -> ServoSample:
-        """Return what the servo says about its motion, asked one time; raises as `FeetechLink.samples`."""
+    def sample_once(self) -> ServoSample:
+        """Return what the servo says about its motion, requested one time; as `FeetechLink.samples`."""
         if not self.torque_limit:  # each question writes it: it must never rise above the servo's own
             self._bound_torque()
         requested = {self.servo_id: (self._settings.model, self.torque_limit)}
@@ -215,24 +203,24 @@ class FeetechServo:
         self.truth.check(sample)
         return sample
 
-    def look(self) -> ServoSample:
-        """Return the same; what was lost is asked for again."""
-        return again(self._link, self.sample)
-
     def stand(self) -> int | None:
-        """Make where the servo is its goal, if its torque is on; returns the goal. Raises as `sample`."""
-        sample = self.sample()
+        """Make where the servo is its goal, if its torque is on; returns the goal. Raises as
+        `sample_once`."""
+        sample = self.sample_once()
         if not sample.values["torque_enable"]:
             return None
-        low, high = self._settings.limit_counts
-        goal = min(max(sample.counts, low), high)
-        self.send({self.servo_id: goal})
+        goal = self._settings.within_limits(sample.counts)
+        self._link.group_write([self.part("goal_position", goal)])
         return goal
 
-    def send(self, goal: Mapping[int, int]) -> None:
-        """Write the goal alone, and nobody answers. Raises LineLost, BadReply."""
-        entry, order = self._registers["goal_position"], self._settings.model.order
-        self._link.group_write(entry.address, {one: entry.encode(g, order) for one, g in goal.items()})
+    def stood(self) -> str:
+        """Have the servo stand, as `BusServo.stood`."""
+        goal = self.stand()
+        if goal is None:
+            return "has its torque off"
+        if (stored := self.get("goal_position")) != goal:  # the packet that says so has no answer
+            raise NoReply(f"{self.name} did not take the command to stand, its goal is {stored}")
+        return "was commanded to stand where it is, and holds"
 
     def _bound_torque(self) -> int:
         """Take the torque limit from the servo's EEPROM and the options; returns that bound, 0.1 %."""
@@ -244,17 +232,8 @@ class FeetechServo:
         self.torque_limit = max(bound, LEAST_TORQUE)
         return bound
 
-    def check_place(self) -> int:
-        """Return the count that may be the axis' goal where it stands, as
-        `ServoAxisSettings.goal_at_place`."""
-        return self._settings.goal_at_place(self.name, self.look().counts)
-
     def set_up(self) -> None:
-        """Bring the servo's permanent settings to what the configuration says; the torque may be off then.
-
-        Raises WrongDevice if a setting must change while torque may not be dropped, or the torque limit has
-        no room.
-        """
+        """As `BusServo`; also that the torque limit has room for the questions' tokens."""
         if "torque_limit" in self._registers and (bound := self._bound_torque()) < LEAST_TORQUE:
             raise WrongDevice(
                 f"{self.name} has the torque limit {bound / 10:g} % in its EEPROM; expected "
@@ -264,81 +243,51 @@ class FeetechServo:
         wanted = {"return_delay": 0, "min_angle_limit": low, "max_angle_limit": high}
         if "operating_mode" in self._registers:
             wanted["operating_mode"] = POSITION_MODE
-        different = {name: value for name, value in wanted.items() if self.get(name) != value}
-        if not different:
-            return
-        changes = ", ".join(f"{name} {value}" for name, value in different.items())
-        if self.get("torque_enable"):
-            if not self._head.torque_off_at_start:
-                raise WrongDevice(
-                    f"{self.name} must be set to {changes} with its torque off, and its torque is on: "
-                    "support the axis and set torque_off_at_start: true, or switch the servo off and on"
-                )
-            self.dropped = True
-            self.set("torque_enable", 0)
-        log.info("%s: setting %s", self.name, changes)
-        self._unlocked(different)
+        self._change({name: value for name, value in wanted.items() if self.get(name) != value})
 
-    def _unlocked(self, values: Mapping[str, int], answered: bool = True) -> None:
-        """Set permanent registers with the EEPROM unlocked for them alone."""
-        lock, model = self._registers["lock"], self._settings.model
-        if not answered:
-            self._link.write_unanswered(self.servo_id, lock, UNLOCKED, model)
-        else:
-            self.set("lock", UNLOCKED)
-        try:
+    def _set_permanent(self, values: Mapping[str, int]) -> None:
+        with self._unlocked():
             for name, value in values.items():
-                if answered:
-                    self.set(name, value)
-                else:
-                    self._link.write_unanswered(self.servo_id, self._registers[name], value, model)
+                self.set(name, value)
+
+    @contextmanager
+    def _unlocked(self, answers: bool = True) -> Iterator[None]:
+        """Unlock the EEPROM within; a stop or a closing that breaks it off leaves it locked."""
+        if answers:
+            self.set("lock", UNLOCKED)
+        else:
+            self._link.write_unanswered(self.servo_id, self._registers["lock"], UNLOCKED)
+        try:
+            yield
         finally:
-            with self._link.undisturbed():  # a stop or a closing that broke it off leaves none unlocked
+            with self._link.undisturbed():
                 self.set("lock", LOCKED)
 
     @property
     def profile(self) -> tuple[int, int]:
-        """Acceleration and speed of the configuration, in the servo's counts; an SCS has no acceleration."""
-        settings, head = self._settings, self._head
-        acceleration = min(254, settings.acceleration_counts(head.acceleration_rad_per_s2))
-        speed = settings.velocity_counts(head.speed_rad_per_s)
-        return (1 if settings.model.is_scs else acceleration), speed
+        """Acceleration and speed of the configuration, in its counts; an SCS has no acceleration."""
+        acceleration, speed = super().profile
+        return (1 if self._settings.model.is_scs else min(254, acceleration)), speed
 
-    def goal_bytes(self, profile: tuple[int, int], goal: int) -> tuple[int, bytes]:
-        """Return where a goal with its profile is written, and the bytes; a goal time of 0 means by speed."""
-        model, registers = self._settings.model, self._registers
-        names = ("goal_position", "goal_time", "goal_speed")
-        values = (goal, 0, profile[1])
-        data = b"".join(registers[n].encode(v, model.order) for n, v in zip(names, values, strict=True))
-        if model.is_scs:
-            return registers["goal_position"].address, data
-        return registers["acceleration"].address, bytes((profile[0],)) + data
+    def leg(self, profile: tuple[int, int], goal: int) -> Part:
+        """Return a goal with its profile, as `BusServo.leg`; a goal time of 0 means by speed."""
+        values = {"goal_position": goal, "goal_time": 0, "goal_speed": profile[1]}
+        if not self._settings.model.is_scs:
+            values = {"acceleration": profile[0], **values}
+        return self.neighbours(values)
 
     def send_leg(self, profile: tuple[int, int], goal: int) -> None:
         """Set a goal with its profile; the next sample shows it. Raises LineLost, BadReply."""
-        address, data = self.goal_bytes(profile, goal)
-        self._link.group_write(address, {self.servo_id: data})
+        self._link.group_write([self.leg(profile, goal)])
 
-    def take_hold(self) -> int:
-        """Switch torque on where the axis stands, with the profile set; returns the goal, counts.
-
-        An old goal is void: the present position is the goal before anything can move.
-        """
+    def _aim_at_place(self) -> bool:
         counts = self.check_place()
         if "acceleration" in self._registers:
             self.set("acceleration", self.profile[0])
         self.set("goal_time", 0)
         self.set("goal_speed", self.profile[1])
         self.set("goal_position", counts)
-        if not self.get("torque_enable"):
-            counts = self.check_place()
-            self.set("goal_position", counts)
-            try:
-                self.set("torque_enable", 1)
-            except WrongDevice:
-                raise HardwareFault(f"{self.name} does not switch its torque on") from None
-        self.dropped = False
-        return come_to_rest(self.look, self.set, self._settings.limit_counts, self._link.clock)
+        return bool(self.get("torque_enable"))
 
     def release(self, limp: bool) -> None:
         """Switch the torque off if it is to be ``limp``, and lift the questions' tokens; for the end."""
@@ -351,13 +300,17 @@ class FeetechServo:
             log.warning("%s is not left as it should be at the end: %s", self.name, error)
 
 
-def fault_words(name: str, error: int) -> str:
+def status_fault(name: str, error: int) -> str:
     """Return one sentence for a status."""
-    return f"{name} reports {status_words(error)} (status 0x{error:02x}); it says so as long as it lasts"
+    faults = " and ".join(status_faults(error))
+    return f"{name} reports {faults} (status 0x{error:02x}); it says so as long as it lasts"
 
 
-class FeetechAxis(ServoAxis[FeetechServo, FeetechAxisSettings]):
+class FeetechAxis(ServoAxis):
     """One axis, whose way is sent in parts."""
+
+    servo: FeetechServo
+    settings: FeetechAxisSettings
 
     def __init__(
         self, servo: FeetechServo, clock: Clock, settings: FeetechAxisSettings, head: FeetechSettings
@@ -365,8 +318,8 @@ class FeetechAxis(ServoAxis[FeetechServo, FeetechAxisSettings]):
         super().__init__(servo, clock, settings, head)
         self._lease_s = head.lease_s
 
-    def stretch(self) -> int:
-        """Return how far the axis may be sent now."""
+    def reach(self) -> int:
+        """Return how far the axis may be sent now, as a goal."""
         motion = self.motion
         return motion.stretch(self._lease_s, self.acceleration_rad_per_s2) if self._lease_s else motion.goal
 
@@ -375,120 +328,38 @@ class FeetechAxis(ServoAxis[FeetechServo, FeetechAxisSettings]):
         motion = self.motion
         if motion.next_leg() is not None:
             motion.begin_leg()
-            goal: int | None = self.stretch()
+            goal: int | None = self.reach()
         else:
-            goal = motion.more_of_the_way(self.stretch())
+            goal = motion.more_of_the_way(self.reach())
         if goal is not None:
             self.servo.send_leg(motion.profile or self.servo.profile, goal)
             motion.note_sent(goal)
 
 
-class FeetechPair(ServoPair[FeetechLink, FeetechAxis]):
+class FeetechPair(ServoPair):
     """Pan and tilt on one open line, as `ServoPair`."""
 
-    def __init__(self, link: FeetechLink, head: FeetechSettings, offsets: dict[int, int]) -> None:
-        axes = (("pan", head.pan), ("tilt", head.tilt))
-        super().__init__(
-            link,
-            [
-                FeetechAxis(FeetechServo(link, name, axis, head, offsets), link.clock, axis, head)
-                for name, axis in axes
-            ],
+    link: FeetechLink
+    axes: tuple[FeetechAxis, ...]
+
+    def __init__(self, link: FeetechLink, head: FeetechSettings, memory: FeetechMemory) -> None:
+        super().__init__(link)
+        link.questions = memory.questions
+        self.axes = tuple(
+            FeetechAxis(FeetechServo(link, name, axis, head, memory), link.clock, axis, head)
+            for name, axis in (("pan", head.pan), ("tilt", head.tilt))
         )
 
     def samples(self) -> list[ServoSample]:
         """Return what both servos say about their motion now; raises as `FeetechLink.samples`."""
+        servos = [axis.servo for axis in self.axes]
         requested = {
             axis.servo.servo_id: (axis.settings.model, axis.servo.torque_limit) for axis in self.axes
         }
         found = self.link.samples(requested)
-        for axis in self.axes:
-            axis.servo.truth.check(found[axis.servo.servo_id])
-        return [found[axis.servo.servo_id] for axis in self.axes]
-
-    def sample(self, axis: FeetechAxis) -> ServoSample:
-        """Return what one servo says about its motion now, asking it alone; raises as `samples`."""
-        return axis.servo.sample()
-
-    def send_goals(self, goals: Sequence[int], speeds: Sequence[int]) -> Sequence[int]:
-        """Write profile and goal of both axes with one packet, as far as the lease allows; returns that.
-
-        Raises LineLost, BadReply.
-        """
-        data, address, sent = {}, 0, []
-        for axis, speed in zip(self.axes, speeds, strict=True):
-            axis.motion.profile = axis.servo.profile[0], speed
-            sent.append(axis.stretch())
-            address, data[axis.servo.servo_id] = axis.servo.goal_bytes(axis.motion.profile, sent[-1])
-            axis.motion.note_sent(sent[-1])
-        self.link.group_write(address, data)
-        return sent
-
-    def brake(self) -> None:
-        """Tell each axis that holds to brake, whatever the line or the other axis does. Raises LineLost."""
-        data, address = {}, 0
-        for axis in self.axes:
-            goal = axis.halt()
-            if goal is not None:
-                entry = axis.settings.model.registers["goal_position"]
-                address, data[axis.servo.servo_id] = (
-                    entry.address,
-                    entry.encode(goal, axis.settings.model.order),
-                )
-        if data:
-            self.link.write_at_once(address, data, BRAKE_COPIES)
-
-    def stood(self, axis: FeetechAxis) -> str:
-        """Command one axis to stand, as `ServoPair.stood`. Raises DriverError."""
-        servo = axis.servo
-        goal = servo.stand()
-        if goal is None:
-            return "has its torque off"
-        if (stored := servo.get("goal_position")) != goal:  # nobody answers the packet that says so
-            raise NoReply(f"{servo.name} did not take the command to stand, its goal is {stored}")
-        return "was commanded to stand where it is, and holds"
-
-
-def open_pair(
-    head: FeetechSettings,
-    questions: Questions | None = None,
-    offsets: dict[int, int] | None = None,
-    urgent: Callable[[], bool] = lambda: False,
-    clock: Clock | None = None,
-    open_line: OpenLine = SerialLine,
-) -> FeetechPair:
-    """Open the line to both servos; nothing is set.
-
-    ``questions`` and ``offsets`` are of the head, over all its lines; ``urgent``, ``clock`` and ``open_line``
-    of `Port`. Raises LineLost, BadReply.
-    """
-    link = open_link(
-        head.port, head.baud, head.reply_timeout_s, urgent,
-        questions=questions, clock=clock, open_line=open_line,
-    )  # fmt: skip
-    return FeetechPair(link, head, {} if offsets is None else offsets)
-
-
-def make_ready(pair: FeetechPair, head: FeetechSettings) -> None:
-    """Make both servos ready, without moving them: checked, set up, holding.
-
-    Without a lease each is commanded to stand first, whatever the other does: it may still be under way.
-    Raises Overtaken if a stop came meanwhile; LineLost, NoReply, BadReply, WrongDevice, HardwareFault if the
-    servos cannot be reached or do not fit.
-    """
-    servos = [axis.servo for axis in pair.axes]
-    if not head.lease_s:
-        pair.stand()
-    with pair.holding_in_the_end():
         for servo in servos:
-            servo.check_identity()
-        for servo in servos:
-            servo.check_health()
-            servo.check_place()
-        for servo in servos:
-            servo.set_up()
-        for axis in pair.axes:
-            axis.take_hold()
+            servo.truth.check(found[servo.servo_id])
+        return [found[servo.servo_id] for servo in servos]
 
 
 TOO_FAST = 3.0
@@ -498,14 +369,14 @@ times as fast as one that was taken for one of 1 count."""
 FAST_SPAN_S = 0.04
 
 
-class FeetechWatch(SessionWatch[FeetechAxis]):
+class FeetechWatch(SessionWatch):
     """The watch over two servos, as `SessionWatch`; a trip is a lease that has run out under way."""
 
-    trip_words = "the lease of a move ran out: this process was silent for too long; stop ends it"
+    trip_fault = "the lease of a move ran out: this process was silent for too long; stop ends it"
     trip_refusal = "the lease of a move ran out; stop lets the head move again"
 
     def __init__(self, pair: FeetechPair, lease_s: float) -> None:
-        super().__init__(pair.axes)
+        super().__init__(pair)
         self._pair = pair
         self._lease_s = lease_s
         self._too_fast: dict[str, str] = {}
@@ -519,8 +390,8 @@ class FeetechWatch(SessionWatch[FeetechAxis]):
             log.error("the head stood at the end of its lease: this process was silent for too long")
             self._pair.brake()
 
-    def look(self) -> None:
-        """Look whether both servos are as they were left.
+    def check(self) -> None:
+        """See that both servos are as they were left.
 
         Raises GivenUp if something set or restarted them that was not this driver; LineLost if the line is
         gone while an axis is braked that turns too fast.
@@ -534,14 +405,13 @@ class FeetechWatch(SessionWatch[FeetechAxis]):
                 axis.hardware_error = ""
             if axis.motion.holds and not sample.values["torque_enable"]:
                 if not axis.hardware_error:
-                    words = f"{axis.servo.name} has its torque off: it restarted, or somebody else set it"
-                    raise GivenUp(BadReply(words))
+                    raise distrusted(f"{axis.servo.name} has its torque off")
                 axis.motion.limp()
-            if (words := axis.motion.other_goal_words()) and not axis.hardware_error:
-                raise GivenUp(BadReply(f"{words}: it restarted, or somebody else set it"))
-            self._see_speed(axis)
+            if (reason := axis.motion.foreign_goal()) and not axis.hardware_error:
+                raise distrusted(reason)
+            self._check_speed(axis)
 
-    def _see_speed(self, axis: FeetechAxis) -> None:
+    def _check_speed(self, axis: FeetechAxis) -> None:
         """Brake an axis that turns much faster than was commanded."""
         sample, name, profile = axis.motion.sample, axis.servo.name, axis.motion.profile
         assert sample is not None
@@ -560,68 +430,36 @@ class FeetechWatch(SessionWatch[FeetechAxis]):
             log.error("%s", self._too_fast[name])
             self._pair.brake()
 
-    def note_alert(self, axis: FeetechAxis) -> None:
+    def note_alert(self, axis: ServoAxis) -> None:
         """A servo reports a fault: brake both axes and say which. Raises LineLost."""
         sample = axis.motion.sample
         self._pair.brake()
         assert sample is not None
-        axis.hardware_error = fault_words(axis.servo.name, sample.values["status"])
+        axis.hardware_error = status_fault(axis.servo.name, sample.values["status"])
         if not sample.values["torque_enable"]:
             axis.hardware_error += "; its torque is off"
             axis.motion.limp()
         log.error("%s", axis.hardware_error)
 
-    def own_words(self, axis: FeetechAxis) -> list[str]:
+    def faults_of(self, axis: ServoAxis) -> list[str]:
         """Return what forbids an axis to move: its servo's fault, a speed that was not commanded."""
-        return [*super().own_words(axis), *filter(None, [self._too_fast.get(axis.servo.name)])]
-
-
-def open_head(
-    options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
-) -> FeetechHead:
-    """Open the head that the options of ``driver: feetech`` describe; see `settings.FeetechSettings`.
-
-    Raises BadOptions for options that cannot be; LineLost, NoReply, BadReply, WrongDevice, HardwareFault if
-    the servos cannot be reached or do not fit; the line is closed again.
-    """
-    return FeetechHead(feetech_settings(options), clock, open_line)
+        return [*super().faults_of(axis), *filter(None, [self._too_fast.get(axis.servo.name)])]
 
 
 class FeetechHead(BusHead):
     """The head; parameters and errors as of `BusHead`."""
 
     settings: FeetechSettings
-
-    def __init__(
-        self, settings: FeetechSettings, clock: Clock | None = None, open_line: OpenLine = SerialLine
-    ) -> None:
-        self._questions = Questions()
-        self._offsets: dict[int, int] = {}
-        super().__init__(settings, clock, open_line)
-
-    def _open(self) -> FeetechPair:
-        return open_pair(
-            self.settings, self._questions, self._offsets, self._bus.urgent, self._clock, self._open_line
-        )
+    settings_type, link_type, pair_type = FeetechSettings, FeetechLink, FeetechPair
+    memory_type = FeetechMemory
 
     def _watch(self, pair: FeetechPair) -> FeetechWatch:
-        make_ready(pair, self.settings)
         return FeetechWatch(pair, self.settings.lease_s)
 
 
-def halt(
-    options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
-) -> list[str]:
-    """Command each axis that holds to stand, as `halt_axes`; its torque stays as it is.
-
-    ``clock`` and ``open_line`` are those of `FeetechLink`. Raises BadOptions, LineLost, NoReply.
-    """
-    with closing(open_pair(feetech_settings(options), clock=clock, open_line=open_line)) as pair:
-        return halt_axes(pair)
-
-
+open_head, halt = FeetechHead.from_options, FeetechHead.halt_alone
 BENCH = ServoBench(
-    "feetech", open_link, scan, facts, set_id,
+    "feetech", FeetechLink, present, facts, set_id,
     (1_000_000, 115_200, 500_000, 250_000, 128_000, 76_800, 57_600, 38_400), (1_000_000, 115_200, 500_000),
     MODELS, "STS3215", POLL_BYTES,
 )  # fmt: skip

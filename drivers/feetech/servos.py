@@ -8,38 +8,36 @@ A packet is ``FF FF``, id, length, instruction or status, data, and an inverted 
 one wrong byte is always seen, several pass once in 256. Nothing is stuffed. A reply has no sequence number
 and does not say what was requested. What proves a sample is:
 
-- **Length.** Each question asks for another number of bytes, `STARTS` of them in turn; another length is no
+- **Length.** Each question reads another number of bytes, `STARTS` of them in turn; another length is no
   answer.
 - **Token** (STS, SMS). Just before it, each question writes a number into the torque limit of both servos, up
   to `TOKENS` steps of 0.1 % below what is configured, and reads it back within the answer. Together that is
   the number of a question out of `STARTS * TOKENS`: a reply is distinguished from any up to 271 questions
   late.
 - **Agreement** (SCS, which has no such register). For `LATE_S` after a reply that was lost, wrong or one too
-  many, each question is asked twice, by two lengths, and the answers have to fit. This proves less: a reply
+  many, each question is sent twice, by two lengths, and the answers have to fit. This proves less: a reply
   that is later than that, or two that are late alike, are taken.
 
-What is read for one register is asked twice around a silence, by two lengths, and has to agree.
+What is read for one register is read twice around a silence, by two lengths, and has to agree.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property
 from types import MappingProxyType
 from typing import Literal
 
-from drivers.clock import Clock
 from drivers.errors import BadOptions, BadReply, DriverError, LineLost, NoReply, WrongDevice
 from drivers.faults import nearest
-from drivers.serial_line import OpenLine, SerialLine
-from drivers.servo_bus.bench import FoundServo, Scan, ServoFacts, changing, check_change, scanned
+from drivers.servo_bus.bench import FoundServo, ServoFacts, changing, check_change
 from drivers.servo_bus.course import ServoSample
-from drivers.servo_bus.exchange import ATTEMPTS, REPLY_TIMEOUT_S, BusLink, again
-from drivers.servo_bus.port import QUIET_S, PacketFormat, StatusPacket
+from drivers.servo_bus.exchange import ATTEMPTS, BusLink, again
+from drivers.servo_bus.port import QUIET_S, PacketFormat, Part, Register, StatusPacket, at_header
 from drivers.servo_bus.settings import CountedModel
 
 BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
@@ -49,7 +47,7 @@ lerobot's table (57,600, 38,400, 19,200 for the codes 5 to 7) contradicts the ma
 """
 
 # ERRBIT_VOLTAGE, ANGLE, OVERHEAT, OVERELE, OVERLOAD of the maker's scservo_sdk (protocol_packet_handler.py).
-STATUS_WORDS = MappingProxyType(
+STATUS_FAULTS = MappingProxyType(
     {
         0x01: "input voltage out of its limits",
         0x02: "angle sensor fault",
@@ -63,7 +61,7 @@ UNLOCKED, LOCKED = 0, 1
 
 
 @dataclass(frozen=True)
-class Register:
+class Item(Register):
     """One entry of a memory table.
 
     Attributes
@@ -72,50 +70,50 @@ class Register:
         The bit that says minus; the rest is the size of the number. None for a number of zero or more.
     """
 
-    name: str
-    address: int
-    size: int = 1
     sign_bit: int | None = None
+    order: Literal["little", "big"] = "little"
 
-    def decode(self, data: bytes, order: Literal["little", "big"]) -> int:
-        """Return the value of the register's bytes."""
-        word = int.from_bytes(data, order)
+    def decode(self, data: bytes) -> int:
+        """Return its value, as `Register`."""
+        word = int.from_bytes(data, self.order)
         if self.sign_bit is None:
             return word
         size = word & ((1 << self.sign_bit) - 1)
         return -size if word >> self.sign_bit & 1 else size
 
-    def encode(self, value: int, order: Literal["little", "big"]) -> bytes:
-        """Return a value as the register's bytes; OverflowError if it does not fit."""
+    def encode(self, value: int) -> bytes:
+        """Return its bytes, as `Register`."""
         if value < 0 and self.sign_bit is not None:
             value = -value | 1 << self.sign_bit
-        return value.to_bytes(self.size, order)
+        return value.to_bytes(self.size, self.order)
 
 
-def _table(*more: Register) -> Mapping[str, Register]:
+def _table(order: Literal["little", "big"], *more: Item) -> Mapping[str, Item]:
     """The registers that all series have where SCS and STS have them, and more."""
     common = (
-        Register("firmware_major", 0), Register("firmware_minor", 1), Register("model_number", 3, 2),
-        Register("id", 5), Register("baud", 6), Register("return_delay", 7), Register("response_level", 8),
-        Register("min_angle_limit", 9, 2), Register("max_angle_limit", 11, 2),
-        Register("temperature_limit", 13), Register("max_voltage_limit", 14),
-        Register("min_voltage_limit", 15), Register("max_torque", 16, 2),
-        Register("unload_condition", 19), Register("torque_enable", 40),
-        Register("goal_position", 42, 2), Register("goal_time", 44, 2), Register("goal_speed", 46, 2),
-        Register("present_position", 56, 2, 15), Register("present_velocity", 58, 2, 15),
-        Register("present_load", 60, 2, 10), Register("present_voltage", 62),
-        Register("present_temperature", 63), Register("status", 65), Register("moving", 66),
+        Item("firmware_major", 0), Item("firmware_minor", 1), Item("model_number", 3, 2),
+        Item("id", 5), Item("baud", 6), Item("return_delay", 7), Item("response_level", 8),
+        Item("min_angle_limit", 9, 2), Item("max_angle_limit", 11, 2),
+        Item("temperature_limit", 13), Item("max_voltage_limit", 14),
+        Item("min_voltage_limit", 15), Item("max_torque", 16, 2),
+        Item("unload_condition", 19), Item("torque_enable", 40),
+        Item("goal_position", 42, 2), Item("goal_time", 44, 2), Item("goal_speed", 46, 2),
+        Item("present_position", 56, 2, 15), Item("present_velocity", 58, 2, 15),
+        Item("present_load", 60, 2, 10), Item("present_voltage", 62),
+        Item("present_temperature", 63), Item("status", 65), Item("moving", 66),
     )  # fmt: skip
-    return MappingProxyType({r.name: r for r in sorted((*common, *more), key=lambda r: r.address)})
+    every = sorted((*common, *more), key=lambda register: register.address)
+    return MappingProxyType({register.name: replace(register, order=order) for register in every})
 
 
 STS = _table(
-    Register("protective_current", 28, 2), Register("offset", 31, 2, 11), Register("operating_mode", 33),
-    Register("protective_torque", 34), Register("protective_time", 35), Register("overload_torque", 36),
-    Register("acceleration", 41), Register("torque_limit", 48, 2), Register("lock", 55),
-    Register("present_current", 69, 2, 15),
+    "little",
+    Item("protective_current", 28, 2), Item("offset", 31, 2, 11), Item("operating_mode", 33),
+    Item("protective_torque", 34), Item("protective_time", 35), Item("overload_torque", 36),
+    Item("acceleration", 41), Item("torque_limit", 48, 2), Item("lock", 55),
+    Item("present_current", 69, 2, 15),
 )  # fmt: skip
-SCS = _table(Register("protective_torque", 37), Register("protective_time", 38), Register("lock", 48))
+SCS = _table("big", Item("protective_torque", 37), Item("protective_time", 38), Item("lock", 48))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,14 +126,13 @@ class FeetechModel(CountedModel):
         Counts a second of one unit of its speed: 1, or 50 in some firmware.
     """
 
-    registers: Mapping[str, Register]
-    order: Literal["little", "big"]
+    registers: Mapping[str, Item]
     speed_unit_counts: int = 1
 
     @property
     def is_scs(self) -> bool:
         """Whether it is of the SCS series: no torque limit, no acceleration, no read of several servos."""
-        return self.order == "big"
+        return self.registers is SCS
 
     def with_speed_unit(self, counts: int) -> FeetechModel:
         """Return it with another unit of speed."""
@@ -156,7 +153,6 @@ def _model(name: str, number: int | None) -> FeetechModel:
         velocity_unit_rad_per_s=turn_rad / counts,
         acceleration_unit_rad_per_s2=100 * turn_rad / counts,
         current_unit_A=None if scs else 0.0065,
-        order="big" if scs else "little",
     )
 
 
@@ -186,11 +182,11 @@ def model_named(name: str) -> FeetechModel:
     return found
 
 
-def status_words(error: int) -> str:
-    """Return what a status says, in plain words; empty for a servo that is well."""
-    words = [word for bit, word in STATUS_WORDS.items() if error & bit]
-    unknown = error & ~sum(STATUS_WORDS)
-    return " and ".join(words + ([f"unknown status bits 0x{unknown:02x}"] if unknown else []))
+def status_faults(error: int) -> list[str]:
+    """Return the faults in a status; none for a servo that is well."""
+    faults = [fault for bit, fault in STATUS_FAULTS.items() if error & bit]
+    unknown = error & ~sum(STATUS_FAULTS)
+    return faults + ([f"unknown status bits 0x{unknown:02x}"] if unknown else [])
 
 
 HEADER = b"\xff\xff"
@@ -211,11 +207,10 @@ def sync_read_packet(address: int, length: int, servo_ids: tuple[int, ...]) -> b
     return instruction_packet(BROADCAST_ID, SYNC_READ, bytes((address, length, *servo_ids)))
 
 
-def sync_write_packet(address: int, data: Mapping[int, bytes]) -> bytes:
-    """Return a write of equally many bytes to each of several servos, by id; nobody answers it."""
-    length = max(map(len, data.values()), default=0)
-    body = b"".join(bytes((servo_id,)) + one for servo_id, one in data.items())
-    return instruction_packet(BROADCAST_ID, SYNC_WRITE, bytes((address, length)) + body)
+def group_write_packet(parts: Sequence[Part]) -> bytes:
+    """Return a write of the same registers of several servos; none answers it."""
+    body = b"".join(bytes((part.servo_id,)) + part.data for part in parts)
+    return instruction_packet(BROADCAST_ID, SYNC_WRITE, bytes((parts[0].address, parts[0].length)) + body)
 
 
 def take_status(buffer: bytearray, *, at_end: bool = False) -> StatusPacket | None:
@@ -223,17 +218,12 @@ def take_status(buffer: bytearray, *, at_end: bool = False) -> StatusPacket | No
 
     Parameters
     ----------
-    buffer
-        Bytes as they came in; what was used or dropped is removed.
     at_end
         No more bytes will come: a header whose packet is not whole was noise, look behind it.
     """
     while True:
-        start = buffer.find(HEADER)
-        if start < 0:
-            del buffer[: len(buffer) - buffer.endswith(b"\xff")]
+        if not at_header(buffer, HEADER):
             return None
-        del buffer[:start]
         if len(buffer) >= STATUS_BYTES or (len(buffer) >= 3 and buffer[2] > HIGHEST_ID + 1):
             end = 4 + buffer[3]
             if buffer[2] <= HIGHEST_ID + 1 and STATUS_BYTES <= end <= LONGEST_PACKET:
@@ -252,11 +242,12 @@ def take_status(buffer: bytearray, *, at_end: bool = False) -> StatusPacket | No
 FORMAT = PacketFormat(
     take_status,
     instruction_packet,
-    lambda address, length: bytes((address, length)),
+    1,
+    group_write_packet,
     STATUS_BYTES,
     {PING: "ping", READ: "read", WRITE: "write"},
     {},
-    sync_write_packet(40, {}),
+    instruction_packet(BROADCAST_ID, SYNC_WRITE, bytes((40, 0))),
 )
 
 
@@ -277,36 +268,22 @@ class Questions:
 
 
 class FeetechLink(BusLink):
-    """One open line and its transactions, as of `BusLink`.
+    """One open line and its transactions, as of `BusLink`."""
 
-    Parameters
-    ----------
-    port, baud, reply_timeout_s, urgent, clock, open_line
-        As of `BusLink`.
-    """
+    packets = FORMAT
+    finds_echo = True
 
-    def __init__(
-        self,
-        port: str,
-        baud: int,
-        reply_timeout_s: float = REPLY_TIMEOUT_S,
-        urgent: Callable[[], bool] = lambda: False,
-        *,
-        questions: Questions | None = None,
-        clock: Clock | None = None,
-        open_line: OpenLine = SerialLine,
-    ) -> None:
-        super().__init__(port, baud, reply_timeout_s, FORMAT, urgent, clock, open_line)
-        self._questions = questions or Questions()
+    @cached_property
+    def questions(self) -> Questions:
+        """Of this line, unless it is given the head's."""
+        return Questions()
 
     def ping(self, servo_id: int) -> int:
         """Return the status of a servo that is there. Raises NoReply, BadReply, LineLost."""
-        return self.ask(servo_id, PING, b"", 0).error
+        return self.request(servo_id, PING, b"", 0).error
 
     def ping_all(self) -> tuple[list[int], int]:
-        """Ask who is on the line.
-
-        Raises LineLost, BadReply.
+        """Ping every servo on the line. Raises LineLost, BadReply.
 
         Returns
         -------
@@ -323,7 +300,7 @@ class FeetechLink(BusLink):
         noise = port.received_bytes - before - 6 * (len(found) + port.echoes)
         return sorted(set(found)), max(0, noise)
 
-    def proven(self, servo_id: int, register: Register, model: FeetechModel) -> int:
+    def proven(self, servo_id: int, register: Register) -> int:
         """Return a register's value, said twice around a silence by replies of two lengths.
 
         Raises BadReply if the answers contradict one another again and again; NoReply, LineLost.
@@ -332,7 +309,7 @@ class FeetechLink(BusLink):
         for more in range(AGREEING_TRIES):
             data = self.read(servo_id, register.address, size + more % 2, register.name)[:size]
             if data == before:
-                return register.decode(data, model.order)
+                return register.decode(data)
             before = data
             self.quiet(QUIET_S)
         raise BadReply(
@@ -341,30 +318,14 @@ class FeetechLink(BusLink):
         )
 
     def block(self, servo_id: int, address: int, length: int) -> bytes:
-        """Return bytes of one servo's memory, asked one time after a silence. Raises as `proven`."""
+        """Return bytes of one servo's memory, read one time after a silence. Raises as `proven`."""
         self.quiet(QUIET_S)
         return self.read(servo_id, address, length, "memory")
 
-    def write(self, servo_id: int, register: Register, value: int, model: FeetechModel) -> None:
-        """Set a register and wait for the servo's word. Raises NoReply, BadReply, LineLost."""
-        data = bytes((register.address,)) + register.encode(value, model.order)
-        self.ask(servo_id, WRITE, data, 0, register.name)
-
-    def write_unanswered(self, servo_id: int, register: Register, value: int, model: FeetechModel) -> None:
-        """Set a register of a servo that may keep silent about it; an answer is dropped. Raises LineLost."""
-        data = bytes((register.address,)) + register.encode(value, model.order)
-        self.port.send(instruction_packet(servo_id, WRITE, data), 0)
-        self.port.drain()
-
-    def group_write(self, address: int, data: Mapping[int, bytes]) -> None:
-        """Write equally many bytes to each servo with one packet, unanswered. Raises LineLost, BadReply."""
-        self.port.send(sync_write_packet(address, data), 0)
-
-    def write_at_once(self, address: int, data: Mapping[int, bytes], copies: int) -> None:
-        """Write to each servo by a packet of its own, at once and whatever is under way. Raises LineLost."""
-        packets = b"".join(sync_write_packet(address, {one: data[one]}) for one in data)
+    def write_at_once(self, parts: Sequence[Part], copies: int = 1) -> None:
+        """Write as `BusLink.write_at_once`; before the next question the line has to be quiet."""
         self.port.suspect = True
-        self.port.send_now(copies * packets)
+        super().write_at_once(parts, copies)
 
     def samples(self, servos: Mapping[int, tuple[FeetechModel, int]]) -> dict[int, ServoSample]:
         """Return what servos say about their motion now, by id.
@@ -376,15 +337,15 @@ class FeetechLink(BusLink):
         servos
             Of each id its model, all of one series, and its full torque limit, 0.1 %.
         """
-        number = next(self._questions.numbers)
+        number = next(self.questions.numbers)
         start, token = FIRST_START + number % STARTS, number % TOKENS
         if any(model.is_scs for model, _ in servos.values()):
-            return self._asked_singly(servos, start)
+            return self._one_by_one(servos, start)
         end = 71
         limits = {one: limit - token for one, (_, limit) in servos.items()}
-        tokens = {one: limit.to_bytes(2, "little") for one, limit in limits.items()}
+        tokens = [Part(one, 48, 2, limit.to_bytes(2, "little")) for one, limit in limits.items()]
         length, ids = end - start, tuple(servos)
-        question = sync_write_packet(48, tokens) + sync_read_packet(start, length, ids)
+        question = group_write_packet(tokens) + sync_read_packet(start, length, ids)
         try:
             sent_s = self.port.send(question, len(ids) * (STATUS_BYTES + length))
             taken = self._replies(ids, length)
@@ -429,21 +390,21 @@ class FeetechLink(BusLink):
                     )
         return taken
 
-    def _asked_singly(
+    def _one_by_one(
         self, servos: Mapping[int, tuple[FeetechModel, int]], start: int
     ) -> dict[int, ServoSample]:
-        """The same of servos that answer one at a time: said twice where a late reply may be under way."""
+        """The same of servos that answer one at a time: twice where a late reply may be under way."""
         try:
             found = self._round(servos, start)
-            if self.clock.now_s() < self._questions.doubted_until_s:
-                before, next_start = found, FIRST_START + next(self._questions.numbers) % STARTS
+            if self.clock.now_s() < self.questions.doubted_until_s:
+                before, next_start = found, FIRST_START + next(self.questions.numbers) % STARTS
                 found = self._round(servos, next_start)
                 for one, sample in found.items():
-                    self._see_same(one, servos[one][0].speed_unit_counts, before[one], sample)
+                    self._check_same(one, servos[one][0].speed_unit_counts, before[one], sample)
         except LineLost:
             raise
         except DriverError:
-            self._questions.doubted_until_s = self.clock.now_s() + LATE_S
+            self.questions.doubted_until_s = self.clock.now_s() + LATE_S
             raise
         return found
 
@@ -452,15 +413,15 @@ class FeetechLink(BusLink):
         found = {}
         for one, (model, _) in servos.items():
             sent_s = self.clock.now_s()
-            status = self.ask(one, READ, bytes((start, 67 - start)), 67 - start, "motion")
+            status = self.request(one, READ, bytes((start, 67 - start)), 67 - start, "motion")
             values = _values(model, start, status.data)
             found[one] = ServoSample(values, status.alert, sent_s, self.clock.now_s())
             if self.port.suspect:
-                raise BadReply(f"{self.name}: more came than was asked for")
+                raise BadReply(f"{self.name}: more came than was requested")
         return found
 
-    def _see_same(self, one: int, unit: int, before: ServoSample, after: ServoSample) -> None:
-        """See that two samples can follow one another. Raises BadReply."""
+    def _check_same(self, one: int, unit: int, before: ServoSample, after: ServoSample) -> None:
+        """Pass two samples that can follow one another. Raises BadReply."""
         reported = max(abs(sample.values["present_velocity"]) for sample in (before, after))
         speed = unit * (reported + (unit > 1))  # less than one unit more is not reported
         most = SAME_COUNTS + speed * (after.received_s - before.sent_s)
@@ -472,35 +433,13 @@ class FeetechLink(BusLink):
             )
 
 
-def open_link(
-    port: str,
-    baud: int,
-    reply_timeout_s: float = REPLY_TIMEOUT_S,
-    urgent: Callable[[], bool] = lambda: False,
-    *,
-    questions: Questions | None = None,
-    clock: Clock | None = None,
-    open_line: OpenLine = SerialLine,
-) -> FeetechLink:
-    """Open a line and find out whether its adapter echoes; parameters and errors as of `FeetechLink`."""
-    link = FeetechLink(
-        port, baud, reply_timeout_s, urgent, questions=questions, clock=clock, open_line=open_line
-    )
-    try:
-        link.find_echo()
-    except BaseException:
-        link.close()
-        raise
-    return link
-
-
 def _values(model: FeetechModel, start: int, data: bytes) -> dict[str, int]:
-    """The registers in a block by name, and what a course asks for beside them."""
+    """The registers in a block by name, and what `AxisCourse` reads beside them."""
     values = {}
     for register in model.registers.values():
         at = register.address - start
         if register.address >= 40 and at + register.size <= len(data):
-            values[register.name] = register.decode(data[at : at + register.size], model.order)
+            values[register.name] = register.decode(data[at : at + register.size])
     values["moving_status"] = 2 * values["moving"]  # a profile is under way
     values["profile_acceleration"] = values.get("acceleration", 1)
     values["profile_velocity"] = values["goal_speed"]
@@ -508,19 +447,8 @@ def _values(model: FeetechModel, start: int, data: bytes) -> dict[str, int]:
     return values
 
 
-def scan(
-    port: str,
-    bauds: Sequence[int],
-    reply_timeout_s: float,
-    clock: Clock | None = None,
-    open_line: OpenLine = SerialLine,
-) -> Scan:
-    """Ask at every baud rate who is there, as `scanned`; the rest as of `FeetechLink`."""
-    opened = partial(open_link, port, reply_timeout_s=reply_timeout_s, clock=clock, open_line=open_line)
-    return scanned(bauds, opened, _there)
-
-
-def _there(link: FeetechLink) -> tuple[list[FoundServo], int]:
+def present(link: FeetechLink) -> tuple[list[FoundServo], int]:
+    """Return the servos that answer on a line, as `drivers.servo_bus.bench.ServoBench`."""
     ids, noise = link.ping_all()
     found = []
     for servo_id in ids:
@@ -531,10 +459,8 @@ def _there(link: FeetechLink) -> tuple[list[FoundServo], int]:
 
 def _found(link: FeetechLink, servo_id: int) -> FoundServo:
     model, number, firmware = identify(link, servo_id)
-    words = status_words(again(link, lambda: link.ping(servo_id)))
-    return FoundServo(
-        link.baud, servo_id, number, model.name, firmware, tuple(words.split(" and ")) if words else ()
-    )
+    faults = status_faults(again(link, lambda: link.ping(servo_id)))
+    return FoundServo(link.baud, servo_id, number, model.name, firmware, tuple(faults))
 
 
 def identify(link: FeetechLink, servo_id: int) -> tuple[FeetechModel, int, str]:
@@ -551,9 +477,9 @@ def identify(link: FeetechLink, servo_id: int) -> tuple[FeetechModel, int, str]:
         before = data
     little, big = data[3] | data[4] << 8, data[3] << 8 | data[4]
     firmware = f"{data[0]}.{data[1]}"
-    for number, order in ((little, "little"), (big, "big")):
+    for number, registers in ((little, STS), (big, SCS)):
         model = MODELS_BY_NUMBER.get(number)
-        if model is not None and model.order == order:
+        if model is not None and model.registers is registers:
             return model, number, firmware
     return (MODELS["SCS"], big, firmware) if data[2] == 1 else (MODELS["STS"], little, firmware)
 
@@ -564,36 +490,36 @@ def facts(link: FeetechLink, servo_id: int) -> ServoFacts:
     registers = model.registers.values()
     end = max(register.address + register.size for register in registers)
     data = again(link, lambda: link.block(servo_id, 0, end))
-    values = {r.name: r.decode(data[r.address : r.address + r.size], model.order) for r in registers}
+    values = {r.name: r.decode(data[r.address : r.address + r.size]) for r in registers}
     name = model.name if model.number else f"{model.name} (number {number}, not in the table)"
-    return ServoFacts(servo_id, name, firmware, values, _words(model, values))
+    return ServoFacts(servo_id, name, firmware, values, _meanings(model, values))
 
 
-def _words(model: FeetechModel, values: Mapping[str, int]) -> dict[str, str]:
+def _meanings(model: FeetechModel, values: Mapping[str, int]) -> dict[str, str]:
     """What numbers mean."""
-    words = {
+    found = {
         name: f"{math.degrees((values[name] - model.centre_count) * model.count_rad):.3f} deg from its middle"
         for name in ("min_angle_limit", "max_angle_limit", "goal_position", "present_position")
     }
     for name in ("max_voltage_limit", "min_voltage_limit", "present_voltage"):
-        words[name] = f"{values[name] / 10:.1f} V"
+        found[name] = f"{values[name] / 10:.1f} V"
     for name in ("max_torque", "torque_limit", "present_load"):
         if name in values:
-            words[name] = f"{values[name] / 10:.1f} %"
-    words["baud"] = f"{BAUD_RATES[values['baud']]} baud" if values["baud"] < len(BAUD_RATES) else "unknown"
-    words["status"] = status_words(values["status"]) or "well"
-    words["torque_enable"] = "on" if values["torque_enable"] else "off"
-    words["lock"] = "EEPROM locked" if values["lock"] else "EEPROM unlocked"
+            found[name] = f"{values[name] / 10:.1f} %"
+    found["baud"] = f"{BAUD_RATES[values['baud']]} baud" if values["baud"] < len(BAUD_RATES) else "unknown"
+    found["status"] = " and ".join(status_faults(values["status"])) or "well"
+    found["torque_enable"] = "on" if values["torque_enable"] else "off"
+    found["lock"] = "EEPROM locked" if values["lock"] else "EEPROM unlocked"
     if "offset" in values:
         turn = f"{math.degrees(values['offset'] * model.count_rad):.3f} deg"
-        words["offset"] = f"{turn}, part of every position; mastctl never writes it"
-    return words
+        found["offset"] = f"{turn}, part of every position; mastctl never writes it"
+    return found
 
 
 def set_id(
     link: FeetechLink, old: int, new: int, new_baud: int | None = None, *, torque_off: bool = False
 ) -> None:
-    """Give a servo another id, and another baud rate if asked; see that it took them.
+    """Give a servo another id, and another baud rate if wanted; see that it took them.
 
     A change that is broken off says what the servo is left with. Raises BadOptions for ids or a baud rate
     that cannot be; WrongDevice if the new id is taken, or torque is on and ``torque_off`` is not given;
@@ -607,29 +533,29 @@ def set_id(
             raise WrongDevice(f"id {new} is taken by another servo; choose another")
         link.quiet(0.05)
     registers = model.registers
-    if link.proven(old, registers["torque_enable"], model):
+    if link.proven(old, registers["torque_enable"]):
         if not torque_off:
             raise WrongDevice(
                 f"the torque of servo {old} is on: support what hangs on it and give --torque-off"
             )
-        link.write(old, registers["torque_enable"], 0, model)
-    link.write(old, registers["lock"], UNLOCKED, model)
+        link.write(old, registers["torque_enable"], 0)
+    link.write(old, registers["lock"], UNLOCKED)
     with changing(link, "feetech", old, new_baud) as change:
         try:
             if old != new:
                 change.ids = [old, new]
-                link.write_unanswered(old, registers["id"], new, model)
+                link.write_unanswered(old, registers["id"], new)
                 if change.new_baud is not None:
                     link.ping(new)  # before its rate changes
                     change.ids = [new]
             if change.new_baud is not None:
                 change.bauds.append(change.new_baud)
-                link.write_unanswered(new, registers["baud"], BAUD_RATES.index(change.new_baud), model)
+                link.write_unanswered(new, registers["baud"], BAUD_RATES.index(change.new_baud))
                 link.set_baud(change.new_baud)
-            link.write(new, registers["lock"], LOCKED, model)
+            link.write(new, registers["lock"], LOCKED)
         except BaseException:  # it has the one id or the other, and its EEPROM stays unlocked under neither
             for servo_id in {new, old}:
                 with suppress(DriverError):
-                    link.write(servo_id, registers["lock"], LOCKED, model)
+                    link.write(servo_id, registers["lock"], LOCKED)
             raise
         link.ping(new)

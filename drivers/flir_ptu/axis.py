@@ -52,23 +52,12 @@ class SeenPosition:
 
 
 class StepAxis:
-    """One axis.
-
-    Parameters
-    ----------
-    name
-        ``pan`` or ``tilt``.
-    resolution_arcsec
-        The size of one position, by the unit.
+    """One axis, in positions, positions a second, and positions a second squared.
 
     Attributes
     ----------
-    lowest, highest
-        The unit's own limits, positions.
     slowest, fastest
         The unit's own bounds of speed, positions a second.
-    acceleration
-        Of the unit, positions a second squared.
     speed
         Set in the unit, None if unknown; ``usual_speed`` is that of moves that name none.
     target
@@ -146,7 +135,7 @@ class StepAxis:
             least = math.ceil(1e5 * slowest * self.position_rad) / 1e5
             raise OutOfRange(
                 f"speed {speed_rad_per_s:g} rad/s is below the {least:g} rad/s at which the unit's "
-                f"{self.name} axis turns slowest; ask for a higher speed"
+                f"{self.name} axis turns slowest; request a higher speed"
             )
         return wanted
 
@@ -223,7 +212,7 @@ class StepAxis:
         """Return whether it was at its target and still for so long when it was seen last."""
         return self.arrived and self._dwell_s >= dwell_s
 
-    def stall_words(self) -> str:
+    def stall_fault(self) -> str:
         """Say that it stands still away from its target for longer than any start takes; else empty."""
         patience_s = max(STALL_S, 5.0 / max(self.speed or 1, 1))
         if self.seen is None or self.target is None or self.arrived or self._dwell_s <= patience_s:
@@ -240,35 +229,35 @@ class StepCount:
     Attributes
     ----------
     lost
-        By axis, why its count is lost, in words; empty while it is good. It stays lost.
-    doubted
+        By axis, why its count is lost; empty while it is good. It stays lost.
+    suspected
         Where the axes stood, rad, when a limit hit was reported of one that stood still; empty if none was.
-        To be checked, and then compared by `look_back`.
+        To be checked, and then compared by `compare_places`.
     halt_owed
         Whether a moving axis has hit its limit since the unit was halted last (halting clears this).
     """
 
     def __init__(self) -> None:
         self.lost: dict[str, str] = {}
-        self.doubted: dict[str, float] = {}
+        self.suspected: dict[str, float] = {}
         self.halt_owed = False
 
     def hit(self, axis: str, axes: Mapping[str, StepAxis]) -> None:
         """Note a limit hit of an axis; ``axes`` as they are known, empty before the unit is checked."""
-        if self.doubted:
+        if self.suspected:
             return
         if axes and all(one.rests for one in axes.values()):
             log.warning("%s: the unit reports a limit hit of the %s axis, which stands still", DEVICE, axis)
-            self.doubted = {name: one.angle_rad for name, one in axes.items()}
+            self.suspected = {name: one.angle_rad for name, one in axes.items()}
             return
         self.halt_owed = True
         if axis not in self.lost:
             self.lost[axis] = HIT.format(axis=axis)
             log.warning("%s: %s", DEVICE, self.lost[axis])
 
-    def look_back(self, axes: Mapping[str, StepAxis]) -> None:
+    def compare_places(self, axes: Mapping[str, StepAxis]) -> None:
         """Compare the axes, checked anew, with their places when a limit hit was reported; that is over."""
-        stood, self.doubted = self.doubted, {}
+        stood, self.suspected = self.suspected, {}
         for name, before_rad in stood.items():
             if abs(axes[name].angle_rad - before_rad) > 1.5 * axes[name].position_rad:
                 self._note_jump(name, before_rad, axes[name].angle_rad)
@@ -288,6 +277,6 @@ class StepCount:
 
     def _note_jump(self, axis: str, before_rad: float, after_rad: float) -> None:
         """An axis is where it cannot be by itself."""
-        words = JUMPED.format(axis=axis, before=before_rad, after=after_rad)
-        self.lost[axis] = words
-        log.warning("%s: %s", DEVICE, words)
+        message = JUMPED.format(axis=axis, before=before_rad, after=after_rad)
+        self.lost[axis] = message
+        log.warning("%s: %s", DEVICE, message)

@@ -2,12 +2,12 @@
 
 The answer to a question is the next line that fits it, within a deadline of the clock. A line that does not
 fit is an error, never skipped in silence, unless it is the last answer once more. After any error the two
-sides may be out of step: an answer may still be under way. Then nothing is asked before `in_step` has let the
-line fall quiet and has asked the resolutions of both axes, whose words no other answer has. A unit answers in
-order, so everything under way has come by then and was thrown away. The resolutions also show a reset or
+sides may be out of step: an answer may still be under way. Then nothing is requested before `in_step` has let
+the line fall quiet and has read the resolutions of both axes, whose terms no other answer has. A unit answers
+in order, so everything under way has come by then and was thrown away. The resolutions also show a reset or
 another step mode.
 
-At the start the unit is asked for words and echo (``FV``, ``EE``), because both say which question an answer
+At the start the unit is set to terms and echo (``FV``, ``EE``), because both say which question an answer
 belongs to. A unit ignores the case of letters, but echoes it. So each command is written otherwise than the
 last one (``PP``, ``Pp``, ``pP``), and the echo shows which of several alike is answered. One that stays terse
 or without such an echo is understood too; it is listened to for longer after an error.
@@ -40,7 +40,7 @@ T = TypeVar("T")
 
 REPLY_S = 0.3
 """How long a unit may think before its answer is complete, beyond the time the bytes take on the wire."""
-REPLY_BYTES = 70  # a command, its echo and the longest answer in words
+REPLY_BYTES = 70  # a command, its echo and the longest verbose answer
 QUIET_S = 0.06
 LONGEST_DRAIN_S = 0.4
 PATIENT_TRIES = 3
@@ -57,7 +57,7 @@ class StopCameFirst(DriverError):
 
 @dataclass(frozen=True)
 class _Manners:
-    """How a unit answers: in words, with an echo of the command, and with one letter by letter."""
+    """How a unit answers: in sentences, with an echo of the command, and with one letter by letter."""
 
     verbose: bool | None = None
     echo: bool | None = None
@@ -69,12 +69,8 @@ class Conversation:
 
     Parameters
     ----------
-    line
-        Open; closed by `close`.
     on_hit
         Called with the axis, ``pan`` or ``tilt``, whenever an unrequested limit hit comes.
-    clock
-        What its deadlines run on; it goes on while a thread waits for the line.
 
     Attributes
     ----------
@@ -123,14 +119,14 @@ class Conversation:
         self._in_step = True
         return found
 
-    def ask(self, query: Query) -> float:
+    def value_of(self, query: Query) -> float:
         """Return the number that answers a query.
 
         Raises NoReply if the answer did not come in time; BadReply if something came that is not its answer;
         Refused if the unit will not; LineLost.
         """
         text = self._exchange(query.letters, self.reply_s)
-        number = number_of(text, query.words, bool(self._manners.verbose))
+        number = number_of(text, query.terms, bool(self._manners.verbose))
         if number is None:
             self._in_step = False
             raise BadReply(f"answered {query.letters} with '{text[:80]}'", device=self._device)
@@ -139,29 +135,29 @@ class Conversation:
     def sure(self, query: Query, first: float | None = None) -> float:
         """Return the number that answers a query twice in a row; ``first`` is an earlier answer.
 
-        For values that are asked once and then used all the time: the protocol has no checksum. Raises as
-        `ask`, and BadReply if no two answers are the same.
+        For values that are read once and then used all the time: the protocol has no checksum. Raises as
+        `value_of`, and BadReply if no two answers are the same.
         """
-        return self._twice(query.letters, lambda: self.ask(query), first)
+        return self._twice(query.letters, lambda: self.value_of(query), first)
 
     def sure_text(self, command: str) -> str:
         """Return the text that answers a command twice in a row; raises as `sure`."""
-        return self._twice(command, lambda: self.tell(command), None)
+        return self._twice(command, lambda: self.request(command), None)
 
-    def _twice(self, command: str, ask: Callable[[], T], before: T | None) -> T:
+    def _twice(self, command: str, value_of: Callable[[], T], before: T | None) -> T:
         """The first of the answers that is the same as the one before it."""
         answers: list[T] = [] if before is None else [before]
         while len(answers) < AGREEING_TRIES:
-            answers.append(ask())
+            answers.append(value_of())
             if len(answers) > 1 and answers[-1] == answers[-2]:
                 return answers[-1]
-        words = ", ".join(f"'{str(one)[:40]}'" for one in answers)
-        raise BadReply(f"answers {command} otherwise each time: {words}", device=self._device)
+        found = ", ".join(f"'{str(one)[:40]}'" for one in answers)
+        raise BadReply(f"answers {command} otherwise each time: {found}", device=self._device)
 
-    def tell(self, command: str, patience_s: float = 0.0) -> str:
+    def request(self, command: str, patience_s: float = 0.0) -> str:
         """Send a command and return the text of its answer, mostly empty.
 
-        ``patience_s`` is what the unit may need beyond the usual time. Raises as `ask`.
+        ``patience_s`` is what the unit may need beyond the usual time. Raises as `value_of`.
         """
         return self._exchange(command, self.reply_s + patience_s)
 
@@ -175,7 +171,7 @@ class Conversation:
         self._line.write(b"R ")
         answer = self._next_answer("R", self._clock.now_s() + patience_s, skip=True)
         if not answer.good:
-            raise Refused(f"refuses R: {answer.text or 'without words'}", device=self._device)
+            raise Refused(f"refuses R: {answer.text or 'without a reason'}", device=self._device)
 
     def send_at_once(self, command: str) -> None:
         """Send a command beside a call under way, from any thread.
@@ -195,8 +191,7 @@ class Conversation:
         """Take the answer of what was sent at once; return whether it was a good one, and nothing else came.
 
         A unit answers in order, and echoes letter by letter which question it answers: so both sides are in
-        step still. If anything is otherwise, or nothing was sent at once, `tell` says what is to be
-        done. Raises LineLost.
+        step still. If anything is otherwise, or nothing was sent at once, `request` it. Raises LineLost.
         """
         if not (self._unanswered and self._in_step and self._manners.exact):
             return False
@@ -221,7 +216,7 @@ class Conversation:
 
     @contextmanager
     def patient(self) -> Iterator[None]:
-        """Within this, what was not answered as it should be is asked again, some times."""
+        """Within this, what was not answered as it should be is requested again, some times."""
         self._tries = PATIENT_TRIES
         try:
             yield
@@ -263,17 +258,17 @@ class Conversation:
             raise BadReply(f"answered another {command} than this one", device=self._device)
         self._in_step = True
         if not answer.good:
-            raise Refused(f"refuses {command}: {answer.text or 'without words'}", device=self._device)
+            raise Refused(f"refuses {command}: {answer.text or 'without a reason'}", device=self._device)
         return answer.text
 
     def _give_way(self, command: str) -> None:
-        """Raise Interrupted if something was sent at once; what makes a unit ready goes through with it."""
+        """Raise StopCameFirst if something was sent at once; what makes a unit ready goes through with it."""
         if self._unanswered and self.gives_way and self._tries == 1:
             self._in_step = True
             raise StopCameFirst(f"a stop came before {command} was sent", device=self._device)
 
     def _speaks_twice(self, line: bytes) -> bool:
-        """Whether a line that nobody asked for puts the last answer in doubt: it may be the true one."""
+        """Whether an unrequested line puts the last answer in doubt: it may be the true one."""
         rest = without_hits(line)
         if rest in (b"", self._answered) or (rest == b"*" and hits_of(line)):  # once more; the end of a reset
             return False
@@ -319,11 +314,11 @@ class Conversation:
                 answer = self._next_answer(written, until_s, skip=True)
             except NoReply:
                 if refusal:
-                    words = f"does not report its {axis} resolution: {refusal}"
-                    raise Refused(words, device=self._device) from None
+                    message = f"does not report its {axis} resolution: {refusal}"
+                    raise Refused(message, device=self._device) from None
                 raise
             other = {"pan": "tilt", "tilt": "pan"}[axis]
-            number = number_of(answer.text, query.words, " " in answer.text) if answer.good else None
+            number = number_of(answer.text, query.terms, " " in answer.text) if answer.good else None
             if other in answer.text.lower().split():
                 number = None
             if self._manners.exact and answer.echo and not answer.exact:

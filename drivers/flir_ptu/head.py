@@ -23,7 +23,7 @@ from drivers.absent import Absence, stop_at_last
 from drivers.approach import check_goal
 from drivers.clock import Clock, ClockLock, SystemClock, deadlines_on
 from drivers.errors import BadReply, DriverError, HardwareFault, LineLost, NoReply
-from drivers.flir_ptu import protocol as ask
+from drivers.flir_ptu import protocol as queries
 from drivers.flir_ptu.axis import StepAxis, StepCount
 from drivers.flir_ptu.conversation import Conversation, StopCameFirst
 from drivers.flir_ptu.options import DEVICE, Options, options_from
@@ -51,8 +51,6 @@ def open_head(
 
     Parameters
     ----------
-    options
-        See `drivers.flir_ptu.options`.
     clock
         Stamps the readings, and deadlines run on it if it goes on by itself; the machine's monotonic clock
         when left out.
@@ -61,13 +59,7 @@ def open_head(
 
 
 class FlirPtu(PanTilt):
-    """An open unit; safe to use from any thread. Opening stops it and moves nothing.
-
-    Attributes
-    ----------
-    version
-        The unit's own description.
-    """
+    """An open unit; safe to use from any thread. Opening stops it and moves nothing."""
 
     def __init__(self, options: Options, clock: Clock, open_line: OpenLine) -> None:
         self._options = options
@@ -76,7 +68,7 @@ class FlirPtu(PanTilt):
         self._open_line = open_line
         self._turn = ClockLock(self._time)
         self._stop_over = self._time.signal()
-        self._stop_asked = False
+        self._stop_requested = False
         self._finishing = False  # whether a thread sends last stretches
         self._leg_due = False  # whether it waits for its turn: readings one after another leave it none
         self._count = StepCount()
@@ -108,7 +100,7 @@ class FlirPtu(PanTilt):
                 if self._time.now_s() > until_s:
                     raise
             with self._stop_over:
-                if self._stop_asked:
+                if self._stop_requested:
                     self._stop_over.wait(STOP_OVER_S)
 
     def _read(self) -> Reading:
@@ -118,25 +110,18 @@ class FlirPtu(PanTilt):
             if self._count.halt_owed:
                 self._halt(talk)
             settled = all(axis.settled(self._options.settle_s) for axis in (pan, tilt))
-            if settled:  # a moving head is asked for nothing but its place
-                with suppress(NoReply, BadReply):  # the place is known; the supply is asked for again
-                    self._supply.look(talk)
+            if settled:  # of a moving head only the place is read
+                with suppress(NoReply, BadReply):  # the place is known; the supply is requested again
+                    self._supply.check(talk)
             return Reading(pan.angle_rad, tilt.angle_rad, not settled, time_s, self._faults())
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         """Start both axes together towards the nearest positions; a thread carries an approach on.
 
-        Raises
-        ------
-        OutOfRange
-            For an angle outside the limits, or a speed that is no positive number or below the unit's
-            slowest (31 positions/s); nothing moves. Speeds between are rounded down.
-        HardwareFault
-            If the unit has lost count of its position.
-        Refused
-            If the unit will not, in its own words.
-        NoReply, BadReply, LineLost
-            If it did not confirm; unless only the last step is unconfirmed, nothing moves.
+        Raises OutOfRange for an angle outside the limits, or a speed that is no positive number or below the
+        unit's slowest (31 positions/s); nothing moves. Speeds between are rounded down; HardwareFault if the
+        unit has lost count of its position; Refused if the unit will not, with its reason; NoReply, BadReply,
+        LineLost if it did not confirm; unless only the last step is unconfirmed, nothing moves.
         """
         goals = {"pan": pan_rad, "tilt": tilt_rad}
         limits = [self._axes[name].options.limits_rad for name in goals]
@@ -149,18 +134,18 @@ class FlirPtu(PanTilt):
             for name, axis in self._axes.items():
                 axis.next_target = None
                 self._set_speed(talk, axis, speeds[name])
-            talk.tell("S")
+            talk.request("S")
             for name, (target, _) in ways.items():
-                talk.tell(f"{name[0].upper()}P{target}")
-            if self._count.doubted:
-                words = "reported a limit hit while it stood still; it is checked before it moves"
-                raise BadReply(words, device=DEVICE)
-            if self._stop_asked:
+                talk.request(f"{name[0].upper()}P{target}")
+            if self._count.suspected:
+                message = "reported a limit hit while it stood still; it is checked before it moves"
+                raise BadReply(message, device=DEVICE)
+            if self._stop_requested:
                 raise DriverError("a stop came before the move was started", device=DEVICE)
             for name, axis in self._axes.items():
                 axis.sent(ways[name][0], self._clock.now_s())
             self._supply.due_s = 0.0  # what the way drew from it is judged where it ends
-            talk.tell("I")
+            talk.request("I")
             for name, axis in self._axes.items():
                 axis.next_target = ways[name][1]
             if self._has_legs and not self._finishing:
@@ -170,27 +155,28 @@ class FlirPtu(PanTilt):
     def stop(self) -> None:
         """Halt both axes; they hold where they come to rest, and no second leg of a move follows.
 
-        If another call is under way, anything has to be asked first, or unrequested bytes came, the halt goes
-        out at once. A call under way gets the answer that it waits for, and then gives way; where anything
-        else comes, the halt goes out again in order. A line that is away is tried at once: a unit has no
-        watchdog that silence would trip. Raises NoReply, BadReply, LineLost if the unit did not confirm.
+        If another call is under way, anything has to be requested first, or unrequested bytes came, the halt
+        goes out at once. A call under way gets the answer that it waits for, and then gives way; where
+        anything else comes, the halt goes out again in order. A line that is away is tried at once: a unit
+        has no watchdog that silence would trip. Raises NoReply, BadReply, LineLost if the unit did not
+        confirm.
         """
-        self._stop_asked = True
+        self._stop_requested = True
         free = self._turn.acquire(blocking=False)
         try:
             self._forget_legs()
-            in_order = free and self._talk is not None and self._talk.is_in_step and not self._count.doubted
+            in_order = free and self._talk is not None and self._talk.is_in_step and not self._count.suspected
             if not in_order:
                 self._halt_beside()
             try:
                 self._halt_in_order()
-            except BadReply:  # perhaps of bytes that nobody asked for, and nothing was sent yet
+            except BadReply:  # perhaps of unrequested bytes, and nothing was sent yet
                 self._halt_beside()
                 self._halt_in_order()
         finally:
             self._forget_legs()  # those of a move that was under way beside it, whatever the unit has said
             with self._stop_over:
-                self._stop_asked = False
+                self._stop_requested = False
                 self._stop_over.notify_all()
             if free:
                 self._turn.release()
@@ -214,9 +200,9 @@ class FlirPtu(PanTilt):
             talk = self._talk or self._connect()
             talk.gives_way = gives_way
             try:
-                if self._count.doubted:
+                if self._count.suspected:
                     self._check(talk, talk.in_step())
-                    self._count.look_back(self._axes)
+                    self._count.compare_places(self._axes)
                 elif not talk.is_in_step:
                     self._come_into_step(talk)
                 yield talk
@@ -229,7 +215,7 @@ class FlirPtu(PanTilt):
 
     def _connect(self) -> Conversation:
         """Open the line, check the unit, and leave it standing still; not too often."""
-        if self._time.now_s() < self._absence.again_s and not self._stop_asked:
+        if self._time.now_s() < self._absence.again_s and not self._stop_requested:
             self._absence.check()
         self._deaf = True  # a unit that homes itself at power-up reports its limit switches
         try:
@@ -266,7 +252,7 @@ class FlirPtu(PanTilt):
         resolutions = talk.in_step()
         pan = self._axes["pan"]
         changed = any(axis.resolution_arcsec != resolutions[name] for name, axis in self._axes.items())
-        if changed or (pan.speed is not None and round(talk.ask(ask.SPEED["pan"])) != pan.speed):
+        if changed or (pan.speed is not None and round(talk.value_of(queries.SPEED["pan"])) != pan.speed):
             log.warning("%s: resolution or speed are not as they were; it was reset or restarted", DEVICE)
             self._check(talk, resolutions)
 
@@ -281,7 +267,7 @@ class FlirPtu(PanTilt):
             self._supply.begin(talk)
 
     def _hit(self, axis: str) -> None:
-        """The unit tells that an axis ran into its limit switch."""
+        """The unit reports that an axis ran into its limit switch."""
         if not self._deaf:
             self._count.hit(axis, self._axes)
 
@@ -305,13 +291,13 @@ class FlirPtu(PanTilt):
         """Set an axis's speed unless it is set already."""
         if axis.speed != speed:
             axis.speed = None
-            talk.tell(f"{axis.name[0].upper()}S{speed}")
+            talk.request(f"{axis.name[0].upper()}S{speed}")
             axis.speed = speed
 
     def _halt(self, talk: Conversation) -> None:
         """Halt both axes; a halt that was sent beside another call needs its answer only."""
         if not talk.sent_at_once("H"):
-            talk.tell("H")
+            talk.request("H")
         self._count.halt_owed = False
         for axis in self._axes.values():
             axis.stopped(self._clock.now_s())
@@ -320,7 +306,7 @@ class FlirPtu(PanTilt):
         """Send a halt at once beside whatever is under way, if there is a line."""
         talk = self._talk
         if talk is not None:
-            with suppress(LineLost):  # told by what is asked next
+            with suppress(LineLost):  # reported by the next request
                 talk.send_at_once("H")
 
     def _halt_in_order(self) -> None:
@@ -367,14 +353,14 @@ class FlirPtu(PanTilt):
             if any(axis.seen is None or axis.seen.time_s < since_s for axis in (pan, tilt)):
                 measure(talk, pan, tilt, self._clock)
             for axis in (pan, tilt):
-                if axis.next_target is not None and axis.at_target and not self._stop_asked:
-                    talk.tell(f"{axis.name[0].upper()}P{axis.next_target}")
+                if axis.next_target is not None and axis.at_target and not self._stop_requested:
+                    talk.request(f"{axis.name[0].upper()}P{axis.next_target}")
                     axis.sent(axis.next_target, self._clock.now_s())
 
     def _faults(self) -> tuple[str, ...]:
-        """What is wrong, in plain words."""
-        stalls = (axis.stall_words() for axis in self._axes.values())
-        return (*self._count.lost.values(), *self._supply.words, *(words for words in stalls if words))
+        """What is wrong, in sentences."""
+        stalls = (axis.stall_fault() for axis in self._axes.values())
+        return (*self._count.lost.values(), *self._supply.faults, *(stall for stall in stalls if stall))
 
 
 def halt(
@@ -394,7 +380,7 @@ def halt(
         talk.send_at_once("H")
         talk.in_step()
         with talk.patient():
-            talk.tell("H")
+            talk.request("H")
     finally:
         talk.close()
     return ["pan and tilt halted (H), confirmed"]

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, WithJsonSchema
 
 from calib.files.records import Text, problem
 from drivers.approach import ApproachedAxis
-from drivers.options import DriverOptions, Ends, one_of, read_options
+from drivers.options import Ascending, DriverOptions, one_of, read_options
 
 DEVICE = "flir_ptu"
 # The manuals name 9600 (default) and 38,400 (4.7.1); that a unit takes the others was seen in no source.
@@ -27,7 +27,7 @@ def _port(port: str) -> str:
 class AxisOptions(ApproachedAxis):
     """One axis; its limits are also the unit's user limits, if it has any."""
 
-    limits_rad: Annotated[tuple[float, float], Ends(-math.tau, math.tau)]
+    limits_rad: Annotated[tuple[float, float], Ascending(-math.tau, math.tau)]
     """What may be commanded; set in the unit too, if it can be."""
     zero_rad: Annotated[float, Field(ge=-math.tau, le=math.tau)] = 0.0
     """The axis's angle where the unit is at position 0."""

@@ -6,7 +6,7 @@ switch puts ``!P`` or ``!T`` in between whenever it happens; a reset gives ``!T!
 command itself stands first: ``PP * Current Pan position is 22``.
 
 The protocol has no checksum. So a line counts only if all of it fits. The echo is the command that was sent,
-the words are those of the requested quantity, and there is one number and nothing else with digits.
+the terms are those of the requested quantity, and there is one number and nothing else with digits.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ _LONGEST_LINE = 400
 
 @dataclass(frozen=True)
 class Query:
-    """A question with a number for an answer: its letters, and words of its verbose answer."""
+    """A question with a number for an answer: its letters, and terms of its verbose answer."""
 
     letters: str
-    words: tuple[str, ...]
+    terms: tuple[str, ...]
 
 
-def _axis_query(letter: str, *words: str) -> dict[str, Query]:
+def _axis_query(letter: str, *terms: str) -> dict[str, Query]:
     """The same question for both axes."""
     return {
-        axis: Query(axis[0].upper() + letter, tuple(axis if word == "AXIS" else word for word in words))
+        axis: Query(axis[0].upper() + letter, tuple(axis if word == "AXIS" else word for word in terms))
         for axis in ("pan", "tilt")
     }
 
@@ -54,8 +54,6 @@ class PtuAnswer:
     ----------
     good
         ``*``, as opposed to ``!``.
-    echo
-        Whether the command stood in front.
     exact
         Whether it did letter by letter, capitals and small ones.
     """
@@ -112,15 +110,15 @@ def answer_of(line: bytes, command: str) -> PtuAnswer | None:
     return None
 
 
-def number_of(text: str, words: tuple[str, ...], verbose: bool) -> float | None:
+def number_of(text: str, terms: tuple[str, ...], verbose: bool) -> float | None:
     """Return the one number in a query's answer; None if the answer is not to that query.
 
     Parameters
     ----------
-    words
-        Lower-case words that a verbose answer to this query holds: ``("current", "pan", "position")``.
+    terms
+        Lower-case terms that a verbose answer to this query holds: ``("current", "pan", "position")``.
     verbose
-        Whether the unit answers in words; a terse answer is the number alone.
+        Whether the unit answers in sentences; a terse answer is the number alone.
     """
     tokens = text.split()
     if not verbose:
@@ -129,7 +127,7 @@ def number_of(text: str, words: tuple[str, ...], verbose: bool) -> float | None:
     others = [token.lower().replace("sec^2", "") for token in tokens if not _NUMBER.match(token)]
     if len(numbers) != 1 or any(character.isdigit() for token in others for character in token):
         return None
-    return float(numbers[0]) if set(words) <= set(others) else None
+    return float(numbers[0]) if set(terms) <= set(others) else None
 
 
 def without_hits(data: bytes) -> bytes:

@@ -1,11 +1,11 @@
-"""Asks a unit as a whole: whether it is ready, where both axes are, how its supply is. Moves nothing.
+"""Queries a unit as a whole: whether it is ready, where both axes are, how its supply is. Moves nothing.
 
 Its protocol cannot detect a damaged digit. So a position is taken at once only where the axis is known to
-rest. Otherwise the unit is asked again. A middle answer is taken if it lies between its neighbours, and these
-are no further apart than the axis can go meanwhile. With one of them damaged, the answer taken still is where
-the axis was during the call. A unit reports one axis at a time. Where both move they are asked by turns. Then
-a middle answer of pan is taken, and tilt for its moment on the straight line between the two middle answers
-around it, if tilt turns evenly there.
+rest. Otherwise the unit is queried again. A middle answer is taken if it lies between its neighbours, and
+these are no further apart than the axis can go meanwhile. With one of them damaged, the answer taken still is
+where the axis was during the call. A unit reports one axis at a time. Where both move they are read by turns.
+Then a middle answer of pan is taken, and tilt for its moment on the straight line between the two middle
+answers around it, if tilt turns evenly there.
 
 The manuals' answer to ``O`` is ``Input 30 VDC @ 86 degF``; units with more sensors list more temperatures.
 They give no bounds for all models, so the bound is by what was there at the start.
@@ -21,7 +21,7 @@ from itertools import pairwise
 
 from drivers.clock import Clock
 from drivers.errors import BadReply, OutOfRange, Refused, WrongDevice
-from drivers.flir_ptu import protocol as ask
+from drivers.flir_ptu import protocol as queries
 from drivers.flir_ptu.axis import SeenPosition, StepAxis
 from drivers.flir_ptu.conversation import Conversation
 from drivers.flir_ptu.options import DEVICE, Options
@@ -35,7 +35,7 @@ MOST_BEND_RAD = 0.01
 RECOMPUTE_S = 10.0  # PA and TA take seconds, the manual says
 
 SUPPLY_EVERY_S = 5.0
-"""How often a resting unit is asked."""
+"""How often a resting unit is queried."""
 SUPPLY_DIP = 0.8
 """Below this part of what it was at the start a supply has fallen."""
 HOTTEST_C = 60.0
@@ -46,9 +46,9 @@ _DEGREES_F = re.compile(r"(-?\d+(?:\.\d+)?) ?(?:deg)?F\b")
 
 
 def measure(talk: Conversation, pan: StepAxis, tilt: StepAxis, clock: Clock) -> float:
-    """Ask for both positions until they can be taken, have the axes take them, and return their moment.
+    """Read both positions until they can be taken, have the axes take them, and return their moment.
 
-    Raises BadReply if the positions contradict each other, or as `Conversation.ask`; NoReply, Refused,
+    Raises BadReply if the positions contradict each other, or as `Conversation.value_of`; NoReply, Refused,
     LineLost.
     """
     seen_of: dict[StepAxis, list[SeenPosition]] = {tilt: [], pan: []}
@@ -58,9 +58,9 @@ def measure(talk: Conversation, pan: StepAxis, tilt: StepAxis, clock: Clock) -> 
         for axis, answers in seen_of.items():
             if axis not in at_rest and found is None:
                 if len(answers) == ASKED_AT_MOST:
-                    words = ", ".join(str(seen.position) for seen in answers)
+                    positions = ", ".join(str(seen.position) for seen in answers)
                     raise BadReply(
-                        f"gives {axis.name} positions that contradict each other: {words}", device=DEVICE
+                        f"gives {axis.name} positions that contradict each other: {positions}", device=DEVICE
                     )
                 answers.append(_measured(talk, axis, clock))
                 if axis.rests_at(answers[-1]):
@@ -75,7 +75,7 @@ def measure(talk: Conversation, pan: StepAxis, tilt: StepAxis, clock: Clock) -> 
 def _measured(talk: Conversation, axis: StepAxis, clock: Clock) -> SeenPosition:
     """One answer, and when it was measured."""
     before_s = clock.now_s()
-    number = talk.ask(ask.POSITION[axis.name])
+    number = talk.value_of(queries.POSITION[axis.name])
     # The unit looks when the question is there; its answer takes ten times as long on the wire.
     took_s = min((clock.now_s() - before_s) / 2, 4 * talk.byte_s)
     return SeenPosition(round(number), before_s + took_s)
@@ -137,12 +137,12 @@ def checked_version(talk: Conversation, options: Options, known: str) -> str:
     Parameters
     ----------
     known
-        Its earlier answers; empty if it was not asked yet.
+        Its earlier answers; empty if it was not queried yet.
     """
     version = talk.sure_text("V")
     if known and version != known:
-        words = f"another unit answers: '{version[:80]}' where '{known[:80]}' was"
-        raise WrongDevice(words, device=DEVICE)
+        message = f"another unit answers: '{version[:80]}' where '{known[:80]}' was"
+        raise WrongDevice(message, device=DEVICE)
     if "E46" in version and None in (options.pan.resolution_arcsec, options.tilt.resolution_arcsec):
         raise WrongDevice(
             "is an E46, which does not know its gears before it was homed: "
@@ -165,27 +165,25 @@ def ready_axes(
 
     Parameters
     ----------
-    resolutions
-        The size of a position, by the unit, seconds of arc.
     known
         The axes before the unit or its line was away, whose usual speeds are kept; empty the first time.
     """
-    talk.tell("H")
+    talk.request("H")
     _try(talk, "CI")  # goals are positions, not speeds
     for command in ("PO0", "TO0", "I"):  # whatever was given in slaved mode and never started is void
-        talk.tell(command)
+        talk.request(command)
     settings = {"pan": options.pan, "tilt": options.tilt}
     axes = {
-        name: StepAxis(name, settings[name], talk.sure(ask.RESOLUTION[name], resolutions[name]))
+        name: StepAxis(name, settings[name], talk.sure(queries.RESOLUTION[name], resolutions[name]))
         for name in settings
     }
     _try(talk, "LE")
     for axis in axes.values():
-        axis.lowest, axis.highest = (int(talk.sure(q[axis.name])) for q in (ask.LOWEST, ask.HIGHEST))
+        axis.lowest, axis.highest = (int(talk.sure(q[axis.name])) for q in (queries.LOWEST, queries.HIGHEST))
         axis.check_limits()
     _limit(talk, axes)
     for name, axis in axes.items():
-        axis.fastest, axis.slowest = talk.sure(ask.FASTEST[name]), talk.sure(ask.SLOWEST[name])
+        axis.fastest, axis.slowest = talk.sure(queries.FASTEST[name]), talk.sure(queries.SLOWEST[name])
         if options.speed_rad_per_s is not None:
             try:
                 axis.usual_speed = axis.speed_from_rad(options.speed_rad_per_s)
@@ -194,8 +192,8 @@ def ready_axes(
         elif name in known:
             axis.usual_speed = known[name].usual_speed
         else:
-            axis.usual_speed = int(talk.sure(ask.SPEED[name]))
-        axis.acceleration = int(talk.sure(ask.ACCELERATION[name]))
+            axis.usual_speed = int(talk.sure(queries.SPEED[name]))
+        axis.acceleration = int(talk.sure(queries.ACCELERATION[name]))
         if options.acceleration_rad_per_s2 is not None:
             _accelerate(talk, axis, options.acceleration_rad_per_s2)
     measure(talk, axes["pan"], axes["tilt"], clock)
@@ -207,8 +205,8 @@ def _limit(talk: Conversation, axes: Mapping[str, StepAxis]) -> None:
     try:
         for name, axis in axes.items():
             for letter, end in zip("NX", axis.soft_limits(), strict=True):
-                talk.tell(f"{name[0].upper()}{letter}U{end}")
-        talk.tell("LU")
+                talk.request(f"{name[0].upper()}{letter}U{end}")
+        talk.request("LU")
     except Refused as error:
         log.info("%s: only its factory limits hold inside the unit (%s)", DEVICE, error)
         _try(talk, "LE")
@@ -218,14 +216,14 @@ def _accelerate(talk: Conversation, axis: StepAxis, acceleration_rad_per_s2: flo
     """Set the acceleration, if the unit has another."""
     positions = max(1, round(acceleration_rad_per_s2 / axis.position_rad))
     if axis.acceleration != positions:
-        talk.tell(f"{axis.name[0].upper()}A{positions}", RECOMPUTE_S)
+        talk.request(f"{axis.name[0].upper()}A{positions}", RECOMPUTE_S)
         axis.acceleration = positions
 
 
 def _try(talk: Conversation, command: str) -> None:
     """Send a command that not every firmware has."""
     try:
-        talk.tell(command)
+        talk.request(command)
     except Refused as error:
         log.info("%s", error)
 
@@ -246,36 +244,28 @@ def supply_of(text: str) -> Supply | None:
     return Supply(float(volts[0]), (max(float(one) for one in degrees) - 32) / 1.8)
 
 
-def supply_words(now: Supply, at_start: Supply) -> tuple[str, ...]:
+def supply_faults(now: Supply, at_start: Supply) -> tuple[str, ...]:
     """Say what is wrong with the supply or the temperature; empty if nothing is."""
-    words = []
+    faults = []
     low = SUPPLY_DIP * at_start.volts
     if now.volts < low:
-        words.append(f"the supply is {now.volts:.1f} V, expected {low:.1f} V or more")
+        faults.append(f"the supply is {now.volts:.1f} V, expected {low:.1f} V or more")
     if now.hottest_c > HOTTEST_C:
-        words.append(f"the unit is at {now.hottest_c:.0f} °C, expected {HOTTEST_C:.0f} °C at most")
-    return tuple(words)
+        faults.append(f"the unit is at {now.hottest_c:.0f} °C, expected {HOTTEST_C:.0f} °C at most")
+    return tuple(faults)
 
 
 class SupplyWatch:
-    """The watch over a unit's supply and temperature.
-
-    Attributes
-    ----------
-    words
-        The faults, in plain words; empty if there are none, or the unit does not report them.
-    due_s
-        When it is judged next, on the clock.
-    """
+    """The watch over a unit's supply and temperature."""
 
     def __init__(self, clock: Clock) -> None:
-        self.words: tuple[str, ...] = ()
+        self.faults: tuple[str, ...] = ()
         self._clock = clock
-        self._at_start: Supply | None = None  # None: this unit does not tell
+        self._at_start: Supply | None = None  # None: this unit does not report it
         self.due_s = 0.0
 
     def begin(self, talk: Conversation) -> None:
-        """Ask what there is, unless that is known; raises as `Conversation.tell`."""
+        """Read what there is, unless that is known; raises as `Conversation.request`."""
         if self._at_start is not None:
             return
         first, again = _supply(talk), _supply(talk)
@@ -283,25 +273,25 @@ class SupplyWatch:
             third = _supply(talk) or again
             self._at_start = sorted((first, again, third), key=lambda supply: supply.volts)[1]
 
-    def look(self, talk: Conversation) -> None:
-        """Ask and judge now and then; a fault counts only if it is measured twice. Raises as `begin`."""
+    def check(self, talk: Conversation) -> None:
+        """Read and judge now and then; a fault counts only if it is measured twice. Raises as `begin`."""
         if self._at_start is None or self._clock.now_s() < self.due_s:
             return
-        words: tuple[str, ...] = ()
+        faults: tuple[str, ...] = ()
         for _ in range(2):
             supply = _supply(talk)
             if supply is None:
-                return  # damaged: asked again by the next reading
-            words = supply_words(supply, self._at_start)
-            if not words:
+                return  # damaged: read again by the next reading
+            faults = supply_faults(supply, self._at_start)
+            if not faults:
                 break
-        self.words, self.due_s = words, self._clock.now_s() + SUPPLY_EVERY_S
+        self.faults, self.due_s = faults, self._clock.now_s() + SUPPLY_EVERY_S
 
 
 def _supply(talk: Conversation) -> Supply | None:
-    """Supply and temperature; None where the unit does not tell, or in words nobody knows."""
+    """Supply and temperature; None where the unit does not report it, or in an unknown form."""
     try:
-        return supply_of(talk.tell("O"))
+        return supply_of(talk.request("O"))
     except Refused as error:
         log.info("%s: it does not report its supply voltage (%s)", DEVICE, error)
         return None

@@ -10,7 +10,7 @@ from typing import Any
 
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, Refused
-from drivers.flir_ptu import protocol as ask
+from drivers.flir_ptu import protocol as queries
 from drivers.flir_ptu.conversation import Conversation
 from drivers.flir_ptu.options import BAUDS, DEVICE
 from drivers.probes import Ends, ProbedHead, UnitBench
@@ -83,41 +83,41 @@ def _talking(line: ByteLine, clock: Clock | None) -> Iterator[Conversation]:
 
 
 def _facts(talk: Conversation) -> Facts:
-    """Ask everything."""
+    """Read everything."""
     resolutions = talk.in_step()
     return Facts(
-        version=talk.tell("V"),
-        supply=_told(talk, "O"),
+        version=talk.request("V"),
+        supply=_optional_text(talk, "O"),
         pan=_axis(talk, "pan", resolutions["pan"]),
         tilt=_axis(talk, "tilt", resolutions["tilt"]),
     )
 
 
 def _axis(talk: Conversation, name: str, resolution_arcsec: float) -> AxisFacts:
-    """Ask everything about one axis."""
+    """Read everything about one axis."""
 
-    def number(query: ask.Query) -> int | None:
+    def number(query: queries.Query) -> int | None:
         try:
-            return round(talk.ask(query))
+            return round(talk.value_of(query))
         except Refused:
             return None
 
     return AxisFacts(
         resolution_arcsec=resolution_arcsec,
-        position=round(talk.ask(ask.POSITION[name])),
-        lowest=number(ask.LOWEST[name]),
-        highest=number(ask.HIGHEST[name]),
-        speed=number(ask.SPEED[name]),
-        fastest=number(ask.FASTEST[name]),
-        acceleration=number(ask.ACCELERATION[name]),
-        step_mode=_told(talk, f"W{name[0].upper()}"),
+        position=round(talk.value_of(queries.POSITION[name])),
+        lowest=number(queries.LOWEST[name]),
+        highest=number(queries.HIGHEST[name]),
+        speed=number(queries.SPEED[name]),
+        fastest=number(queries.FASTEST[name]),
+        acceleration=number(queries.ACCELERATION[name]),
+        step_mode=_optional_text(talk, f"W{name[0].upper()}"),
     )
 
 
-def _told(talk: Conversation, command: str) -> str:
+def _optional_text(talk: Conversation, command: str) -> str:
     """A text that not every firmware gives."""
     try:
-        return talk.tell(command)
+        return talk.request(command)
     except DriverError:
         talk.in_step()
         return ""

@@ -4,13 +4,11 @@ Other people's images are read in two forms. One is PDS3 products of one camera 
 measured mast angles). The other is a CSV beside ordinary image files with the columns
 ``camera,pan_rad,tilt_rad,file``. Pixels of more than 8 bits become 8 by one linear scale for all frames of a
 camera, never one for each: grey levels stay comparable. Of what mastctl itself recorded (MCAP) the facts are
-there at once, a picture when asked for.
+there at once, a picture on request.
 """
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -25,9 +23,10 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from calib.errors import CalibError
-from calib.files import read_bytes
+from calib.errors import BadFile, CalibError
+from calib.files import read_bytes, text_of
 from calib.files.pictures import decode_picture
+from calib.files.tables import check_header, csv_rows
 from drivers.errors import BadFrame, BadOptions
 from drivers.interfaces import Image
 from drivers.recordings.mcap_file import BadRecording, McapEntry, read_at, read_items
@@ -82,7 +81,7 @@ class RecordedFrame:
         """
         try:
             pixels = _pixels(self.path)
-        except BadOptions as error:
+        except CalibError as error:
             raise BadFrame(str(error), device=self.camera) from None
         image = np.asarray(pixels, dtype=np.uint8) if self.scale is None else self.scale.grey(pixels)
         image.setflags(write=False)
@@ -111,30 +110,24 @@ def read_products(
 ) -> list[RecordedPointing]:
     """Return the pointings of PDS3 products taken by one camera, in the order of the paths.
 
-    Raises
-    ------
-    BadOptions
-        If a product cannot be read or has no image or measured mast angles. Also if it is of another
-        instrument or size than the first, or two were taken at the same angles.
+    Raises BadFile if a product cannot be read or has no image or measured mast angles. Also if it is of
+    another instrument or size than the first, or two were taken at the same angles.
     """
     found: list[tuple[float, float, Path]] = []
     samples: list[NDArray[np.generic]] = []
     first: tuple[str, tuple[int, int]] | None = None
     for path in paths:
-        try:
-            product = read_product(path)
-        except CalibError as error:
-            raise BadOptions(str(error), device="replay") from None
+        product = read_product(path)
         pan_rad, tilt_rad = product.azimuth_measured_rad, product.elevation_measured_rad
         if pan_rad is None or tilt_rad is None:
-            raise BadOptions(f"{path}: the label has no measured mast angles", device="replay")
+            raise BadFile(path, "", "the label has no measured mast angles")
         if product.image is None:
-            raise BadOptions(f"{path}: {'; '.join(product.notes) or 'there is no image'}", device="replay")
+            raise BadFile(path, "", "; ".join(product.notes) or "there is no image")
         this = (str(product.label.values.get("INSTRUMENT_ID", "")), product.size_px)
         if first is None:
             first = this
         if this != first:
-            raise BadOptions(f"{path}: {_shown(this)} where {_shown(first)} is expected", device="replay")
+            raise BadFile(path, "", f"{_shown(this)} where {_shown(first)} is expected")
         found.append((pan_rad, tilt_rad, path))
         samples.append(product.image[::SAMPLE_EVERY, ::SAMPLE_EVERY])
     scale = _scale(samples, grey_range_dn)
@@ -144,7 +137,7 @@ def read_products(
 def read_folder(path: Path, grey_range_dn: tuple[float, float] | None = None) -> list[RecordedPointing]:
     """Return the pointings of a CSV ``camera,pan_rad,tilt_rad,file`` with image files beside it.
 
-    Raises BadOptions for a malformed row, an image that cannot be read, images of several sizes from one
+    Raises BadFile for a malformed row, an image that cannot be read, images of several sizes from one
     camera, or two frames of one camera at the same angles.
     """
     rows = _rows(path)
@@ -154,11 +147,8 @@ def read_folder(path: Path, grey_range_dn: tuple[float, float] | None = None) ->
         pixels = _pixels(file)
         size = sizes.setdefault(camera, pixels.shape[:2])
         if pixels.shape[:2] != size:
-            raise BadOptions(
-                f"{path}: {place}: {file.name} has {pixels.shape[1]} x {pixels.shape[0]} pixels where "
-                f"{size[1]} x {size[0]} is expected of {camera}",
-                device="replay",
-            )
+            found = f"{file.name} has {pixels.shape[1]} x {pixels.shape[0]} pixels"
+            raise BadFile(path, place, f"{found} where {size[1]} x {size[0]} is expected of {camera}")
         samples.setdefault(camera, []).append(pixels[::SAMPLE_EVERY, ::SAMPLE_EVERY])
     scales = {camera: _scale(parts, grey_range_dn) for camera, parts in samples.items()}
     return _pointings(
@@ -169,7 +159,7 @@ def read_folder(path: Path, grey_range_dn: tuple[float, float] | None = None) ->
 def _scale(
     samples: Sequence[NDArray[np.generic]], grey_range_dn: tuple[float, float] | None
 ) -> GreyScale | None:
-    """One scale for all frames of a camera; None where all are 8-bit already and no range is asked."""
+    """One scale for all frames of a camera; None where all are 8-bit already and no range is given."""
     if grey_range_dn is not None:
         return GreyScale(*grey_range_dn)
     if all(sample.dtype == np.uint8 for sample in samples):
@@ -188,11 +178,10 @@ def _pointings(frames: Sequence[RecordedFrame]) -> list[RecordedPointing]:
             together = {}
             groups.append((frame, together))
         if frame.camera in together:
-            raise BadOptions(
-                f"{together[frame.camera].path.name} and {frame.path.name} of {frame.camera} were taken at "
-                f"the same angles, {frame.pan_rad:.6g} and {frame.tilt_rad:.6g} rad; one frame is expected",
-                device="replay",
-            )
+            both = f"{together[frame.camera].path.name} and {frame.path.name} of {frame.camera}"
+            angles = f"{frame.pan_rad:.6g} and {frame.tilt_rad:.6g} rad"
+            reason = f"{both} were taken at the same angles, {angles}; one frame is expected"
+            raise BadFile(frame.path.parent, "", reason)
         together[frame.camera] = frame
     return [RecordedPointing(first.pan_rad, first.tilt_rad, together) for first, together in groups]
 
@@ -204,61 +193,44 @@ def _same_place(one: RecordedFrame, other: RecordedFrame) -> bool:
 
 def _pixels(path: Path) -> NDArray[np.generic]:
     """The pixels of a PDS3 product or an ordinary image file."""
+    data = read_bytes(path, MAX_IMAGE_BYTES)
     try:
-        data = read_bytes(path, MAX_IMAGE_BYTES)
         image = read_product(path).image if looks_like_pds3(data) else decode_picture(data, HOW)
-        if image is None:
-            raise ValueError("its label names none")
-    except CalibError as error:
-        raise BadOptions(str(error), device="replay") from None
     except ValueError as error:
-        words = f"{path}: holds no image (PNG, JPEG, TIFF or PDS3) that can be read: {error}"
-        raise BadOptions(words, device="replay") from None
+        reason = f"holds no image (PNG, JPEG, TIFF or PDS3) that can be read: {error}"
+        raise BadFile(path, "", reason) from None
+    if image is None:
+        raise BadFile(path, "", "holds no image: its label names none")
     return image
 
 
 def _rows(path: Path) -> list[tuple[str, str, float, float, Path]]:
-    """Rows of the CSV: where it stands, camera, pan, tilt, image file."""
-    try:
-        text = read_bytes(path, MAX_CSV_BYTES).decode("utf-8-sig")
-        lines = list(csv.reader(io.StringIO(text, newline=""), strict=True))
-    except CalibError as error:
-        raise BadOptions(str(error), device="replay") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise BadOptions(f"{path}: is not CSV in UTF-8: {error}", device="replay") from None
-    expected = ",".join(CSV_COLUMNS)
-    if not lines or [cell.strip() for cell in lines[0]] != list(CSV_COLUMNS):
-        found = ",".join(lines[0])[:60] if lines else "nothing"
-        raise BadOptions(f"{path}: line 1: the header is '{found}'; expected '{expected}'", device="replay")
+    """Rows of the CSV: where it is, camera, pan, tilt, image file."""
+    lines = csv_rows(text_of(read_bytes(path, MAX_CSV_BYTES), path), path)
+    check_header(next(lines, (1, []))[1], path, CSV_COLUMNS)
     rows = []
-    for number, cells in enumerate(lines[1:], start=1):
+    for number, (_, cells) in enumerate(lines, start=1):
         place = f"row {number}"
         if len(cells) != len(CSV_COLUMNS):
-            raise BadOptions(
-                f"{path}: {place}: {len(cells)} cells where {len(CSV_COLUMNS)} are expected", device="replay"
-            )
+            raise BadFile(path, place, f"{len(cells)} cells where {len(CSV_COLUMNS)} are expected")
         camera, pan, tilt, file = (cell.strip() for cell in cells)
-        angles = [
-            _angle(word, f"{path}: {place}, {name}") for word, name in ((pan, "pan_rad"), (tilt, "tilt_rad"))
-        ]
+        pan_rad, tilt_rad = (_angle(cell) for cell in (pan, tilt))
+        for name, cell, angle in (("pan_rad", pan, pan_rad), ("tilt_rad", tilt, tilt_rad)):
+            if not abs(angle) <= math.tau:
+                expected = "an angle of at most a turn, in radians, is expected"
+                raise BadFile(path, f"{place}, {name}", f"'{cell[:40]}' where {expected}")
         if not camera or not file:
-            raise BadOptions(f"{path}: {place}: a camera and a file are expected", device="replay")
-        rows.append((place, camera, angles[0], angles[1], path.parent / file))
+            raise BadFile(path, place, "a camera and a file are expected")
+        rows.append((place, camera, pan_rad, tilt_rad, path.parent / file))
     return rows
 
 
-def _angle(word: str, place: str) -> float:
-    """A joint angle in a cell."""
+def _angle(cell: str) -> float:
+    """A cell's number; not-a-number for none."""
     try:
-        angle = float(word)
+        return float(cell)
     except ValueError:
-        angle = math.nan
-    if not abs(angle) <= math.tau:
-        raise BadOptions(
-            f"{place}: '{word[:40]}' where an angle of at most a turn, in radians, is expected",
-            device="replay",
-        )
-    return angle
+        return math.nan
 
 
 def _shown(this: tuple[str, tuple[int, int]]) -> str:
@@ -268,13 +240,7 @@ def _shown(this: tuple[str, tuple[int, int]]) -> str:
 
 @dataclass(frozen=True)
 class McapFrame:
-    """A frame in a recording.
-
-    Attributes
-    ----------
-    facts
-        The facts beside the image (topic ``/camera/NAME/frame``).
-    """
+    """A frame in a recording."""
 
     facts: Mapping[str, Any]
     path: Path
@@ -318,9 +284,9 @@ def read_frames(path: Path) -> Iterator[McapFrame]:
             camera, _, what = item.channel.topic.removeprefix("/camera/").rpartition("/")
             place = camera, item.message.log_time
             if what == "frame":
-                told = _facts(item.message.data)
-                if told is not None and told["camera"] == camera:
-                    facts[place] = told
+                found = _facts(item.message.data)
+                if found is not None and found["camera"] == camera:
+                    facts[place] = found
             elif what == "image" and place in facts:
                 there = replace(item, message=replace(item.message, data=b""))
                 yield McapFrame(facts.pop(place), file, there)
@@ -353,12 +319,12 @@ def read_recording(path: Path) -> list[RecordedPointing]:
 def _facts(data: bytes) -> dict[str, Any] | None:
     """A frame's facts, None if they are none: another program may have written the topic."""
     try:
-        told = json.loads(data)
-        numbers = [float(told[name]) for name in ("pan_rad", "tilt_rad", "mid_exposure_s")]
-        whole = isinstance(told["camera"], str) and isinstance(told["frame_id"], str) and "moving" in told
+        found = json.loads(data)
+        numbers = [float(found[name]) for name in ("pan_rad", "tilt_rad", "mid_exposure_s")]
+        whole = isinstance(found["camera"], str) and isinstance(found["frame_id"], str) and "moving" in found
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return None
-    return told if whole and np.isfinite(numbers).all() else None
+    return found if whole and np.isfinite(numbers).all() else None
 
 
 def _recorded_image(schema: str, data: bytes, colour: bool) -> Image:

@@ -91,24 +91,21 @@ def is_mcap(path: Path) -> bool:
 def read_items(path: Path, found: McapContents | None = None) -> Iterator[Item]:
     """Yield what a file holds, in its order: header, attachments, metadata, messages.
 
-    Raises
-    ------
-    BadRecording
-        If it cannot be read, or does not begin like an MCAP file; an empty one is a recording of nothing.
-        Damage further on is passed over.
+    Raises BadRecording if it cannot be read, or does not begin like an MCAP file; an empty one is a recording
+    of nothing. Damage further on is passed over.
     """
-    told = found if found is not None else McapContents()
+    contents = found if found is not None else McapContents()
     try:
         with open_plain(path) as file:
             size = file.seek(0, io.SEEK_END)
             file.seek(0)
             begin = file.read(len(MAGIC))
             if begin != MAGIC and MAGIC.startswith(begin):  # its writer died before its first record
-                told.left_over_bytes = len(begin)
+                contents.left_over_bytes = len(begin)
                 return
             if begin != MAGIC:
                 raise BadRecording(f"{path}: is no MCAP file; a recording of mastctl is expected")
-            yield from _items(file, size, told)
+            yield from _items(file, size, contents)
     except OSError as error:
         raise BadRecording(f"{path}: cannot be read: {error.strerror or error}") from None
 
@@ -131,8 +128,8 @@ def read_at(path: Path, entry: McapEntry) -> bytes:
             opcode, length = _FRAME.unpack(file.read(_FRAME.size))
             if length > LARGEST_RECORD:
                 raise ValueError("it has changed")
-            told = McapContents(channels={entry.channel.id: entry.channel})
-            for one in _record(opcode, file.read(length), told, entry.at):
+            contents = McapContents(channels={entry.channel.id: entry.channel})
+            for one in _record(opcode, file.read(length), contents, entry.at):
                 if isinstance(one, McapEntry) and _same(one.message, entry.message):
                     return one.message.data
     except (OSError, ValueError, struct.error) as error:
@@ -145,9 +142,9 @@ def _same(one: Message, other: Message) -> bool:
     return (one.channel_id, one.sequence, one.log_time) == (other.channel_id, other.sequence, other.log_time)
 
 
-def _items(file: BinaryIO, size: int, told: McapContents) -> Iterator[Item]:
+def _items(file: BinaryIO, size: int, contents: McapContents) -> Iterator[Item]:
     """Walk over the records after the magic."""
-    told.whole_bytes = file.tell()
+    contents.whole_bytes = file.tell()
     while True:
         at = file.tell()
         head = file.read(_FRAME.size)
@@ -157,13 +154,13 @@ def _items(file: BinaryIO, size: int, told: McapContents) -> Iterator[Item]:
         if opcode == 0 or length > min(LARGEST_RECORD, size - file.tell()):
             break
         content = file.read(length)
-        told.whole_bytes = file.tell()
+        contents.whole_bytes = file.tell()
         if opcode in _END:
-            told.complete = _ends_whole(file, size)
-            told.whole_bytes = size if told.complete else told.whole_bytes - length - _FRAME.size
+            contents.complete = _ends_whole(file, size)
+            contents.whole_bytes = size if contents.complete else contents.whole_bytes - length - _FRAME.size
             break
-        yield from _record(opcode, content, told, at)
-    told.left_over_bytes = size - told.whole_bytes
+        yield from _record(opcode, content, contents, at)
+    contents.left_over_bytes = size - contents.whole_bytes
 
 
 def _ends_whole(file: BinaryIO, size: int) -> bool:
@@ -172,7 +169,7 @@ def _ends_whole(file: BinaryIO, size: int) -> bool:
     return file.read(len(MAGIC)) == MAGIC
 
 
-def _record(opcode: int, content: bytes, told: McapContents, at: int) -> Iterator[Item]:
+def _record(opcode: int, content: bytes, contents: McapContents, at: int) -> Iterator[Item]:
     """What one record holds; a damaged one holds nothing."""
     if opcode == Opcode.CHUNK:
         try:
@@ -181,10 +178,10 @@ def _record(opcode: int, content: bytes, told: McapContents, at: int) -> Iterato
                 raise ValueError("a chunk that claims to be larger than any is")
             inside = breakup_chunk(chunk, validate_crc=True)
         except Exception:  # whatever a library says of bytes that are no chunk
-            told.damaged += 1
+            contents.damaged += 1
             return
         for inner in inside:
-            yield from _known(inner, told, at)
+            yield from _known(inner, contents, at)
         return
     read = _READ.get(opcode)
     if read is None:
@@ -192,26 +189,28 @@ def _record(opcode: int, content: bytes, told: McapContents, at: int) -> Iterato
     try:
         one = read(content)
     except Exception:  # as above
-        told.damaged += 1
+        contents.damaged += 1
         return
-    yield from _known(one, told, at)
+    yield from _known(one, contents, at)
 
 
-def _known(one: object, told: McapContents, at: int) -> Iterator[Item]:
+def _known(one: object, contents: McapContents, at: int) -> Iterator[Item]:
     """Keep schemas and channels, hand on the rest, each message with its channel."""
     if isinstance(one, Schema):
-        told.schemas[one.id] = one
+        contents.schemas[one.id] = one
     elif isinstance(one, Channel):
-        told.channels[one.id] = one
+        contents.channels[one.id] = one
     elif isinstance(one, Message):
-        channel = told.channels.get(one.channel_id)
+        channel = contents.channels.get(one.channel_id)
         if channel is None:  # its channel was in a damaged chunk
-            told.damaged += 1
+            contents.damaged += 1
             return
-        told.messages += 1
-        told.first_ns = one.log_time if told.first_ns is None else min(told.first_ns, one.log_time)
-        told.last_ns = one.log_time if told.last_ns is None else max(told.last_ns, one.log_time)
-        yield McapEntry(told.schemas.get(channel.schema_id), channel, one, at)
+        contents.messages += 1
+        contents.first_ns = (
+            one.log_time if contents.first_ns is None else min(contents.first_ns, one.log_time)
+        )
+        contents.last_ns = one.log_time if contents.last_ns is None else max(contents.last_ns, one.log_time)
+        yield McapEntry(contents.schemas.get(channel.schema_id), channel, one, at)
     elif isinstance(one, Header | Attachment | Metadata):
         yield one
 

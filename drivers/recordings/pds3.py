@@ -263,18 +263,6 @@ def _read_pixels(
 
     Raises BadFile if the samples are of a kind that is not read, the pointer is malformed, or the file is too
     short.
-
-    Parameters
-    ----------
-    size_px
-        (width, height) of the image.
-
-    Returns
-    -------
-    pixels
-        (height, width) in the machine's byte order; None, with a note, if the image's file is not there.
-    notes
-        Sentences for the user.
     """
     width, height = size_px
     code = _SAMPLES.get(str(block.values.get("SAMPLE_TYPE")))
@@ -356,7 +344,7 @@ class PdsProduct:
         The mast's measured angles; None if the label has none.
     image
         (lines, samples) in the machine's byte order, of the label's sample type; None if its file is absent
-        or was not asked for.
+        or was not requested.
     size_px
         (width, height) = (LINE_SAMPLES, LINES).
     """
@@ -383,11 +371,6 @@ def read_product(path: str | Path, with_image: bool = True) -> PdsProduct:
 
     Raises BadFile if the file is no PDS3 product with an IMAGE object, or what it says of camera, angles or
     image is malformed; the place names group and keyword.
-
-    Parameters
-    ----------
-    with_image
-        Whether to read the pixels too.
     """
     data = read_bytes(path, MAX_FILE_BYTES)
     label = _label(data, path)

@@ -2,8 +2,8 @@
 
 The head is always at one of the recorded pointings. A move goes at once to the recorded pointing nearest to
 the requested angles, if that is within the tolerance. Else it is refused and the message names the nearest.
-The reading is the recorded, *measured* angle, not the asked one. Cameras deliver the frame recorded at the
-pointing with fresh time stamps, at a fixed frame rate.
+The reading is the recorded, *measured* angle, not the requested one. Cameras deliver the frame recorded at
+the pointing with fresh time stamps, at a fixed frame rate.
 
 Replay has no motion in between, no blur, and no frame where none was recorded.
 """
@@ -21,24 +21,25 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
+from calib.errors import BadFile
 from calib.files.records import Text, problem
 from drivers.clock import Clock
 from drivers.errors import BadOptions, DriverError, NoFreshFrame
 from drivers.faults import PAN_TILT, nearest
 from drivers.interfaces import Camera, CameraInfo, Frame, Image, PanTilt, Reading
-from drivers.options import DriverOptions, Ends, read_options
+from drivers.options import Ascending, DriverOptions, read_options
 from drivers.recordings.frames import RecordedPointing, read_folder, read_products, read_recording
 from drivers.registry import Context, Driver
 
 TOLERANCE_RAD = 0.002
-"""How far from a recorded pointing a move may ask, unless the options say otherwise: two Navcam pixels."""
+"""How far from a recorded pointing a move may be, unless the options say otherwise: two Navcam pixels."""
 
 PERIOD_S = 0.1
 EXPOSURE_S = 0.001
 
 
 class NoRecording(DriverError):
-    """Nothing was recorded where the head is asked to go."""
+    """Nothing was recorded where the head is to go."""
 
     code = "no_recording"
 
@@ -65,7 +66,7 @@ class ReplayOptions(DriverOptions):
     """The name that the products' frames go by."""
     tolerance_rad: Annotated[float, Field(ge=1e-9, le=1000.0)] = TOLERANCE_RAD
     """How far from a recorded pointing a move may be."""
-    grey_range_dn: Annotated[tuple[float, float], Ends()] | None = None
+    grey_range_dn: Annotated[tuple[float, float], Ascending()] | None = None
     """What becomes black and white in frames of more than 8 bits."""
 
     @model_validator(mode="after")
@@ -87,12 +88,15 @@ def open_replay(options: Mapping[str, Any], folder: Path, clock: Clock) -> Repla
     Raises BadOptions for options that cannot be and recordings that cannot be read.
     """
     read = read_options(ReplayOptions, options, "replay")
-    if read.products:
-        pointings = read_products(_files(read.products, folder), read.camera, read.grey_range_dn)
-    elif read.recording:
-        pointings = read_recording(folder / read.recording)
-    else:
-        pointings = read_folder(folder / read.frames, read.grey_range_dn)
+    try:
+        if read.products:
+            pointings = read_products(_files(read.products, folder), read.camera, read.grey_range_dn)
+        elif read.recording:
+            pointings = read_recording(folder / read.recording)
+        else:
+            pointings = read_folder(folder / read.frames, read.grey_range_dn)
+    except BadFile as error:
+        raise BadOptions(str(error), device="replay") from None
     if not pointings:
         raise BadOptions("the recording is empty", device="replay")
     head = ReplayedHead(pointings, read.tolerance_rad, clock)
@@ -182,7 +186,7 @@ class ReplayedCamera(Camera):
                 return self._frame(wanted)
             if ready_s > deadline_s and now_s >= deadline_s:
                 raise NoFreshFrame(
-                    f"no frame exposed after the asked moment came within {timeout_s:.3g} s; "
+                    f"no frame exposed after the requested moment came within {timeout_s:.3g} s; "
                     f"the next one ends {ready_s - now_s:.3f} s from now",
                     device=self._name,
                 )
@@ -241,8 +245,8 @@ def _device(options: Mapping[str, Any], context: Context) -> PanTilt | Camera:
     if context.name == PAN_TILT:
         return replay.pan_tilt
     if context.name not in replay.cameras:
-        words = f"the recording has no such camera{nearest(context.name, replay.cameras)}"
-        raise BadOptions(words, device=context.name)
+        message = f"the recording has no such camera{nearest(context.name, replay.cameras)}"
+        raise BadOptions(message, device=context.name)
     return replay.cameras[context.name]
 
 

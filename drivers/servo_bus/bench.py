@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from shlex import quote
-from typing import Any, TypeVar
+from typing import Any
 
 from drivers.clock import Clock
 from drivers.errors import BadOptions, DriverError, WrongDevice
@@ -19,7 +19,6 @@ from drivers.servo_bus.settings import CountedModel
 HIGHEST_ID = 252
 APPROACH_RAD = 0.02
 FASTEST_POLL_HZ, USUAL_BAUD = 50.0, 1_000_000
-L = TypeVar("L", bound=BusLink)
 
 
 @dataclass(frozen=True)
@@ -45,47 +44,13 @@ class Scan:
 
 @dataclass(frozen=True)
 class ServoFacts:
-    """Everything a servo says: its registers as they stand, and in words where a number needs them."""
+    """Everything a servo says: its registers, and what numbers mean that do not say it."""
 
     servo_id: int
     model: str
     firmware: int | str
     values: dict[str, int]
-    words: dict[str, str]
-
-
-def scanned(
-    bauds: Sequence[int], opened: Callable[[int], L], there: Callable[[L], tuple[list[FoundServo], int]]
-) -> Scan:
-    """Return which servos answer, at every baud rate that the adapter has.
-
-    Raises LineLost, BadOptions if the line cannot be opened at all, or the adapter has none of the rates.
-
-    Parameters
-    ----------
-    bauds
-        To try, bits per second.
-    there
-        Returns who answers on it, and how many bytes came that were no reply.
-    """
-    found: list[FoundServo] = []
-    garbled: list[int] = []
-    tried: list[int] = []
-    for baud in bauds:
-        try:
-            link = opened(baud)
-        except BadOptions:
-            if not tried and baud == bauds[-1]:
-                raise
-            continue
-        tried.append(baud)
-        try:
-            servos, noise = there(link)
-        finally:
-            link.close()
-        found += servos
-        garbled += [baud] if noise else []
-    return Scan(tuple(found), tuple(tried), tuple(garbled))
+    meanings: dict[str, str]
 
 
 def check_change(link: BusLink, old: int, new: int, new_baud: int | None, rates: Collection[int]) -> None:
@@ -108,16 +73,16 @@ class Change:
     bauds: list[int]
     new_baud: int | None
 
-    def words(self) -> str:
-        """Say what the servo is left with, and how to go on."""
+    def sentence(self) -> str:
+        """Return what the servo is left with, and how to go on."""
         ids, bauds = " or ".join(map(str, self.ids)), " or ".join(map(str, self.bauds))
         scan = f"'mastctl rig servo scan {self.line} --baud {bauds.replace(' or', '')}' shows which"
-        sentence = f"the servo is left with the id {ids} at {bauds} baud: {scan}"
+        left = f"the servo is left with the id {ids} at {bauds} baud: {scan}"
         if self.new_baud is None:
-            return sentence
+            return left
         new, old = self.ids[-1], self.bauds[0]
         command = f"mastctl rig servo set-id {self.line} {new} {new} --baud {old} --new-baud {self.new_baud}"
-        return f"{sentence}, and '{command}' gives the id {new} its rate"
+        return f"{left}, and '{command}' gives the id {new} its rate"
 
 
 @contextmanager
@@ -131,10 +96,10 @@ def changing(link: BusLink, family: str, old: int, new_baud: int | None) -> Iter
     except BaseException as error:
         if change.ids == [old] and len(change.bauds) == 1:
             raise  # nothing was changed
-        words = f"{str(error) or 'interrupted'}; {change.words()}"
+        message = f"{str(error) or 'interrupted'}; {change.sentence()}"
         if isinstance(error, DriverError):
-            raise type(error)(words, detail=error.detail) from error
-        raise WrongDevice(words) from error
+            raise type(error)(message, detail=error.detail) from error
+        raise WrongDevice(message) from error
 
 
 def line_words(port: str, family: str) -> str:
@@ -148,23 +113,17 @@ class ServoBench:
 
     Attributes
     ----------
-    family
-        The driver's name.
-    open
-        Called with port and rate; returns the open line.
-    scan, facts, set_id
-        As of the family's module.
+    present
+        Returns the servos that answer on a line, and how many bytes came that were no reply.
     bauds, likely_bauds
         Rates of a scan and of a probe, that of the factory or the likeliest first.
     models, usual_model
         Those that the driver turns, and one for a configuration before any is plugged in.
-    poll_bytes
-        Of one reading of both servos on the wire.
     """
 
     family: str
-    open: Callable[[str, int], BusLink]
-    scan: Callable[..., Scan]
+    open: Callable[..., BusLink]
+    present: Callable[[Any], tuple[list[FoundServo], int]]
     facts: Callable[[Any, int], ServoFacts]
     set_id: Callable[..., None]
     bauds: tuple[int, ...]
@@ -183,6 +142,37 @@ class ServoBench:
             f"new servos all have the id 1; connect one at a time, and give the second another id: "
             f"{self.numbering(port, baud)}; then connect both"
         )
+
+    def scan(
+        self,
+        port: str,
+        bauds: Sequence[int],
+        reply_timeout_s: float,
+        clock: Clock | None = None,
+        open_line: OpenLine = SerialLine,
+    ) -> Scan:
+        """Return which servos answer, at every baud rate that the adapter has.
+
+        Raises LineLost, BadOptions if the line cannot be opened at all, or the adapter has none of the rates.
+        """
+        found: list[FoundServo] = []
+        garbled: list[int] = []
+        tried: list[int] = []
+        for baud in bauds:
+            try:
+                link = self.open(port, baud, reply_timeout_s, clock=clock, open_line=open_line)
+            except BadOptions:
+                if not tried and baud == bauds[-1]:
+                    raise
+                continue
+            tried.append(baud)
+            try:
+                servos, noise = self.present(link)
+            finally:
+                link.close()
+            found += servos
+            garbled += [baud] if noise else []
+        return Scan(tuple(found), tuple(tried), tuple(garbled))
 
     def probe(
         self, port: str, path: str, clock: Clock | None = None, open_line: OpenLine = SerialLine
@@ -207,13 +197,7 @@ class ServoBench:
 
 
 class ServosOnLine(ProbedHead):
-    """Servos that answered on a line, or are still to be plugged in.
-
-    Attributes
-    ----------
-    driven
-        Those that the driver turns, by id.
-    """
+    """Servos that answered on a line, or are still to be plugged in."""
 
     speed_rad_per_s = 0.8
 

@@ -1,7 +1,7 @@
 """The one thread that talks on a bus; calls of other threads queue for it with a deadline.
 
-Between calls the thread runs its own round (`Bus` asks it when to come back): reading the servos, feeding
-their watchdogs, coming back after a lost line. Nobody else ever touches the line.
+Between calls the thread runs its own round (`Bus` is given the time of the next): reading the servos, feeding
+their watchdogs, coming back after a lost line. No other thread touches the line.
 
 A stop does not queue: it breaks off what is under way (`Bus.urgent` is queried by the line), and no move that
 was called before it begins after it.
@@ -69,8 +69,6 @@ class Bus:
     between
         Called in the thread whenever no call waits; returns the time of the clock, seconds, at which it
         wants to run again. It must keep what goes wrong itself; what it raises is only logged.
-    clock
-        Every wait runs on it; the machine's when left out.
     """
 
     def __init__(self, name: str, between: Callable[[], float], clock: Clock | None = None) -> None:
@@ -114,8 +112,6 @@ class Bus:
         ----------
         function
             Talks on the line; must end by itself in bounded time.
-        timeout_s
-            How long to wait in all, seconds.
         first
             Go before everything that waits, and have what is under way break off (see `urgent`): a stop.
         moves
@@ -130,8 +126,8 @@ class Bus:
         self._wake()
         if not job.ends_within(timeout_s):
             begun = not job.claimed.acquire(blocking=False)
-            words = "it is still under way" if begun else "its turn did not come"
-            raise NoReply(f"{what} on {self._name} did not end within {timeout_s:g} s: {words}")
+            message = "it is still under way" if begun else "its turn did not come"
+            raise NoReply(f"{what} on {self._name} did not end within {timeout_s:g} s: {message}")
         if isinstance(job.error, Overtaken):
             raise NoReply(f"{what} on {self._name} was {job.error}, since a stop came")
         if job.error is not None:
@@ -200,7 +196,7 @@ class Bus:
             return self._between()
         except Overtaken:
             return self._clock.now_s()
-        except DriverError as error:  # its owner keeps and tells it
+        except DriverError as error:  # its owner keeps and reports it
             log.debug("%s: %s", self._name, error)
         except Exception:  # a defect must not end the thread that feeds the watchdogs
             log.exception("%s: the bus thread's own round failed", self._name)

@@ -141,7 +141,7 @@ class AxisCourse:
         """Return how much of the way to the goal to send now, as a goal.
 
         It reaches as far as the axis comes in ``lease_s`` at its profile's speed, and brakes then: so far an
-        axis goes of which nobody is heard any more.
+        axis goes when its host is gone.
         """
         sample, speed = self._sample, self._speed_rad_per_s
         assert sample is not None
@@ -162,7 +162,7 @@ class AxisCourse:
             return None
         sent = self.goal if self.sent is None else self.sent
         if sample.values["goal_position"] not in (sent, self._sent_before):
-            return None  # somebody else's
+            return None  # another program's
         if self.sent is not None and abs(self.goal - stretch) < abs(self.goal - sent):
             return stretch
         return None if sample.values["goal_position"] == sent else sent
@@ -170,12 +170,12 @@ class AxisCourse:
     def next_leg(self) -> int | None:
         """Return the next goal to send when the present leg has ended; `begin_leg` when it was sent.
 
-        None for a servo that does not hold what was sent: it would turn by somebody else's profile.
+        None for a servo that does not hold what was sent: it would turn by another program's profile.
         """
         sample = self._sample
         if not self._legs or sample is None or not self._arrived(sample) or self._speed(sample) > 1:
             return None
-        if self.other_goal_words():
+        if self.foreign_goal():
             return None
         return self._legs[0]
 
@@ -247,7 +247,7 @@ class AxisCourse:
             return False
         return self._arrived(sample) or not self.holds
 
-    def stuck_words(self, now_s: float) -> str:
+    def stuck_fault(self, now_s: float) -> str:
         """Say that the axis stands away from its goal; empty if it does not."""
         sample = self._sample
         if sample is None or self._rest is None or not self.holds or self._arrived(sample):
@@ -257,7 +257,7 @@ class AxisCourse:
         left_rad = (self.goal - sample.counts) * self.settings.model.count_rad
         return f"{self.name} stands still {abs(left_rad):.4f} rad from its goal: something holds it"
 
-    def other_goal_words(self) -> str:
+    def foreign_goal(self) -> str:
         """Say that the servo holds another goal or profile than was sent; empty if it does not."""
         if self._sample is None or not self.holds or not self._sampled:
             return ""

@@ -8,64 +8,73 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 from drivers.clock import Clock
 from drivers.errors import BadReply, LineLost, NoReply, Refused
-from drivers.serial_line import OpenLine
-from drivers.servo_bus.port import PacketFormat, Port, StatusPacket
+from drivers.serial_line import OpenLine, SerialLine
+from drivers.servo_bus.port import PacketFormat, Part, Port, Register, StatusPacket
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
 
-READ = 2
-"""The instruction that reads, of every family."""
+READ, WRITE = 2, 3
+"""The instructions that read and write, of every family."""
 
 REPLY_TIMEOUT_S = 0.05  # USB adapters hold bytes back for up to 16 ms, the servo for up to 0.5 ms
 ATTEMPTS = 3
 LATE_S = 0.1  # a reply that did not come is waited out this long before the next question
 
 
-def again(link: BusLink, ask: Callable[[], T], late_s: float = LATE_S) -> T:
-    """Ask again after a lost or wrong reply, when one that is merely late has come."""
+def again(link: BusLink, request: Callable[[], T], late_s: float = LATE_S) -> T:
+    """Make a request, again after a lost or wrong reply, when one that is merely late has come."""
     for _ in range(ATTEMPTS - 1):
         try:
-            return ask()
+            return request()
         except (NoReply, BadReply):
             link.quiet(late_s)
-    return ask()
+    return request()
 
 
 class BusLink:
-    """One open line; for one thread at a time.
+    """One open line to servos of a family; for one thread at a time.
 
-    Raises LineLost, BadOptions.
+    Raises LineLost, BadOptions. `Overtaken` may come from every method but `write_at_once`.
 
     Parameters
     ----------
     port, baud, reply_timeout_s, urgent, clock, open_line
-        As of `Port`; `Overtaken` may come from every method but `write_at_once`.
+        As of `Port`.
 
     Attributes
     ----------
-    port
-        What packets are sent and received by.
+    finds_echo
+        Whether it is found out at the start if the adapter gives back what is sent.
     """
+
+    packets: ClassVar[PacketFormat]
+    finds_echo: ClassVar[bool] = False
 
     def __init__(
         self,
         port: str,
         baud: int,
-        reply_timeout_s: float,
-        packets: PacketFormat,
-        urgent: Callable[[], bool],
-        clock: Clock | None,
-        open_line: OpenLine,
+        reply_timeout_s: float = REPLY_TIMEOUT_S,
+        urgent: Callable[[], bool] = lambda: False,
+        *,
+        clock: Clock | None = None,
+        open_line: OpenLine = SerialLine,
     ) -> None:
         self.name = port
-        self.port = Port(port, baud, reply_timeout_s, packets.take, urgent, clock=clock, open_line=open_line)
+        take = self.packets.take
+        self.port = Port(port, baud, reply_timeout_s, take, urgent, clock=clock, open_line=open_line)
         self.clock = self.port.clock
-        self._packets = packets
+        try:
+            if self.finds_echo:
+                self.find_echo()
+        except BaseException:
+            self.close()
+            raise
 
     @property
     def baud(self) -> int:
@@ -76,13 +85,12 @@ class BusLink:
         """Open the line anew at another speed. Raises LineLost, BadOptions."""
         self.port.set_baud(baud)
 
-    def find_echo(self) -> bool:
-        """Return whether the adapter gives back what is sent; if so, that is dropped from now on.
+    def find_echo(self) -> None:
+        """Find out whether the adapter gives back what is sent; if so, that is dropped from now on.
 
         Raises LineLost, BadReply if the line is gone, or never quiet.
         """
-        self.port.echoes = self.port.comes_back(self._packets.to_nobody)
-        return self.port.echoes
+        self.port.echoes = self.port.comes_back(self.packets.to_nobody)
 
     def close(self) -> None:
         """Let go of the line; never raises."""
@@ -96,74 +104,111 @@ class BusLink:
         """Drop what comes until nothing has come for ``quiet_s``: late replies. Raises LineLost, BadReply."""
         self.port.drain(quiet_s, 1.0)
 
-    def ask(
+    def request(
         self, servo_id: int, instruction: int, parameters: bytes, length: int, register: str = ""
     ) -> StatusPacket:
         """Send an instruction to one servo and return its reply of ``length`` bytes.
 
         ``register`` is for messages. Raises NoReply, BadReply, Refused, LineLost.
         """
-        word = self._packets.words[instruction]
-        packet = self._packets.packet(servo_id, instruction, parameters)
+        name = self.packets.instructions[instruction]
+        packet = self.packets.packet(servo_id, instruction, parameters)
         try:
-            self.port.send(packet, self._packets.status_bytes + length)
+            self.port.send(packet, self.packets.status_bytes + length)
             while (status := self.port.receive()) is not None:
                 if status.servo_id != servo_id or not (status.refused or len(status.data) == length):
                     self.note_unexpected(status)
                 elif status.refused:
-                    raise self.refusal(status, word, register)
+                    raise self.refusal(status, name, register)
                 else:
                     return status
         except LineLost as error:
-            raise self.placed(error, [servo_id], word, register) from error
-        raise self.silence(servo_id, word, register)
+            raise self.placed(error, [servo_id], name, register) from error
+        raise self.silence(servo_id, name, register)
 
     def read(self, servo_id: int, address: int, length: int, register: str) -> bytes:
-        """Return bytes of one servo's table, as they seem to be; raises as `ask`."""
-        requested = self._packets.read_parameters(address, length)
-        return self.ask(servo_id, READ, requested, length, register).data
+        """Return bytes of one servo's table, as they seem to be; raises as `request`."""
+        parameters = (number.to_bytes(self.packets.address_bytes, "little") for number in (address, length))
+        return self.request(servo_id, READ, b"".join(parameters), length, register).data
+
+    def write(self, servo_id: int, register: Register, value: int) -> None:
+        """Set a register and wait for the servo's answer; raises as `request`."""
+        self.request(servo_id, WRITE, self._written(register, value), 0, register.name)
+
+    def write_unanswered(self, servo_id: int, register: Register, value: int) -> None:
+        """Set a register of a servo that may keep silent about it; an answer is dropped. Raises LineLost."""
+        self.port.send(self.packets.packet(servo_id, WRITE, self._written(register, value)), 0)
+        self.port.drain()
+
+    def _written(self, register: Register, value: int) -> bytes:
+        """The parameters of a write."""
+        return register.address.to_bytes(self.packets.address_bytes, "little") + register.encode(value)
+
+    def group_write(self, parts: Sequence[Part]) -> None:
+        """Write to several servos with one packet; none answers, so read back what must be certain.
+
+        Raises LineLost, BadReply.
+        """
+        try:
+            self.port.send(self.packets.group_write(parts), 0)
+        except LineLost as error:
+            raise self.placed(error, [part.servo_id for part in parts], "group write") from error
+
+    def write_at_once(self, parts: Sequence[Part], copies: int = 1) -> None:
+        """Write to each of several servos by a packet of its own, at once and whatever is under way.
+
+        None answers, nothing is listened to before, and one servo's packet does not hang on another's: what
+        is sent may collide with a reply, so send more than one copy where it matters. Raises LineLost.
+        """
+        packets = b"".join(self.packets.group_write([part]) for part in parts)
+        try:
+            self.port.send_now(copies * packets)
+        except LineLost as error:
+            raise self.placed(error, [part.servo_id for part in parts], "group write") from error
 
     def note_unexpected(self, status: StatusPacket) -> None:
         """Note a reply to another question; the line is listened to until quiet before the next one."""
         self.port.suspect = True
         log.debug("%s: dropped a reply of id %d to no pending request", self.port.name, status.servo_id)
 
-    def silence(self, servo_id: int, word: str, register: str) -> NoReply:
+    def silence(self, servo_id: int, instruction: str, register: str) -> NoReply:
         """Return the error of a servo that did not answer."""
         self.port.suspect = True
         return NoReply(
             f"servo {servo_id} on {self.port.name} at {self.port.baud} baud gave no usable answer to "
-            f"{_what(word, register)} within {1000 * self.port.reply_timeout_s:g} ms",
-            detail=self.where(servo_id, word, register),
+            f"{_what(instruction, register)} within {1000 * self.port.reply_timeout_s:g} ms",
+            detail=self.where(servo_id, instruction, register),
         )
 
-    def refusal(self, status: StatusPacket, word: str, register: str) -> Refused:
+    def refusal(self, status: StatusPacket, instruction: str, register: str) -> Refused:
         """Return the error of a servo that refused."""
-        reason = self._packets.refusals.get(status.refused, f"unknown error {status.refused}")
+        reason = self.packets.refusals.get(status.refused, f"unknown error {status.refused}")
         alert = ", and it reports a hardware error" if status.alert else ""
         return Refused(
-            f"servo {status.servo_id} on {self.port.name} refused the {_what(word, register)}: "
+            f"servo {status.servo_id} on {self.port.name} refused the {_what(instruction, register)}: "
             f"{reason}{alert}",
-            detail={**self.where(status.servo_id, word, register), "error": status.error},
+            detail={**self.where(status.servo_id, instruction, register), "error": status.error},
         )
 
-    def placed(self, error: LineLost, servo_ids: Sequence[int], word: str, register: str = "") -> LineLost:
+    def placed(
+        self, error: LineLost, servo_ids: Sequence[int], instruction: str, register: str = ""
+    ) -> LineLost:
         """Return the same loss, saying what was being requested."""
         servos = " and ".join(str(servo_id) for servo_id in servo_ids)
-        where = self.where(servo_ids[0], word, register)
-        words = f"{error} during {_what(word, register)} of servo {servos}"
-        return LineLost(words, detail={**where, **error.detail})
+        where = self.where(servo_ids[0], instruction, register)
+        message = f"{error} during {_what(instruction, register)} of servo {servos}"
+        return LineLost(message, detail={**where, **error.detail})
 
-    def where(self, servo_id: int, word: str, register: str) -> dict[str, object]:
+    def where(self, servo_id: int, instruction: str, register: str) -> dict[str, object]:
         """Return the place of an error, for programs."""
         return {
             "port": self.port.name,
             "baud": self.port.baud,
             "servo_id": servo_id,
             "register": register,
-            "instruction": word,
+            "instruction": instruction,
         }
 
 
-def _what(word: str, register: str) -> str:
-    return f"{word} of {register}" if register else word
+def _what(instruction: str, register: str) -> str:
+    return f"{instruction} of {register}" if register else instruction

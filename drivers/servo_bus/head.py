@@ -9,17 +9,19 @@ from __future__ import annotations
 import logging
 import threading
 from abc import abstractmethod
-from collections.abc import Callable
-from contextlib import suppress
-from typing import Any, TypeVar
+from collections.abc import Callable, Mapping
+from contextlib import closing, suppress
+from typing import Any, ClassVar, Self, TypeVar
 
 from drivers.absent import LAST_STOP_S, Absence, stop_at_last
 from drivers.approach import check_goal
 from drivers.clock import Clock, SystemClock, deadlines_on
 from drivers.errors import DriverError, LineLost, NoReply, OutOfRange
 from drivers.interfaces import AxisMotion, AxisReport, HeadInfo, PanTilt, Reading
+from drivers.options import read_options
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.bus import Bus
+from drivers.servo_bus.exchange import BusLink
 from drivers.servo_bus.pair import ServoPair, SessionWatch
 from drivers.servo_bus.port import Overtaken
 from drivers.servo_bus.session import LEFT_WITHIN_S, GivenUp, ServoSession, confirmed, leave, stop_error
@@ -35,7 +37,7 @@ SETTLES_WITHIN_COUNTS = 3
 
 
 class BusHead(PanTilt):
-    """The head; every method may be called from any thread. A family of servos says how it is made ready.
+    """The head; every method may be called from any thread. A family of servos says what it is made of.
 
     Raises LineLost, NoReply, WrongDevice, HardwareFault, Refused.
 
@@ -45,7 +47,19 @@ class BusHead(PanTilt):
         Stamps the readings. Deadlines run on it too if it runs, else on the machine's.
     open_line
         Opens the line, whose waits end by the clock of the deadlines.
+
+    Attributes
+    ----------
+    settings_type, link_type, pair_type
+        Of its options, its line, and the two servos on that.
+    memory_type
+        Of what outlasts a line of the head, and each `ServoPair` is given.
     """
+
+    settings_type: ClassVar[type[HeadSettings]]
+    link_type: ClassVar[type[BusLink]]
+    pair_type: ClassVar[type[Any]]
+    memory_type: ClassVar[type[Any]]
 
     def __init__(
         self, settings: HeadSettings, clock: Clock | None = None, open_line: OpenLine = SerialLine
@@ -54,6 +68,7 @@ class BusHead(PanTilt):
         self._stamps = clock or SystemClock()
         self._clock = deadlines_on(self._stamps)
         self._open_line = open_line
+        self._memory = self.memory_type()
         self._absence = Absence()
         self._closed = False
         self._state = threading.Lock()
@@ -61,6 +76,44 @@ class BusHead(PanTilt):
         self._session: ServoSession | None = self._connect()
         self._motions = [axis.motion for axis in self._session.pair.axes]
         self._bus.start()
+
+    @classmethod
+    def from_options(
+        cls, options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
+    ) -> Self:
+        """Open the head that a configuration's options describe.
+
+        Raises BadOptions for options that cannot be; LineLost, NoReply, BadReply, WrongDevice, HardwareFault,
+        Refused if the servos cannot be reached or do not fit; the line is closed again.
+        """
+        return cls(read_options(cls.settings_type, options), clock, open_line)
+
+    @classmethod
+    def halt_alone(
+        cls, options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
+    ) -> list[str]:
+        """Command each axis that holds to stand, as `ServoPair.halt`; its torque stays as it is.
+
+        Raises BadOptions, LineLost, NoReply.
+        """
+        settings = read_options(cls.settings_type, options)
+        with closing(cls._opened(settings, cls.memory_type(), clock, open_line)) as pair:
+            return pair.halt()
+
+    @classmethod
+    def _opened(
+        cls,
+        head: HeadSettings,
+        memory: Any,
+        clock: Clock | None,
+        open_line: OpenLine,
+        urgent: Callable[[], bool] = lambda: False,
+    ) -> ServoPair:
+        """Open the line to both servos; nothing is set. Raises LineLost, BadReply."""
+        patience_s = head.reply_timeout_s
+        link = cls.link_type(head.port, head.baud, patience_s, urgent, clock=clock, open_line=open_line)
+        pair: ServoPair = cls.pair_type(link, head, memory)
+        return pair
 
     # What the service calls
 
@@ -75,16 +128,11 @@ class BusHead(PanTilt):
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         """Start both axes together towards the angles, rounded to the nearest count, and return.
 
-        Raises
-        ------
-        OutOfRange
-            For an angle outside the limits, or a speed that is no positive number or slower than a servo can
-            be told (0.024 rad/s of an X or MX, 0.001 of a P; its 0 means as fast as it can);
-            nothing moves. Speeds between are rounded down.
-        HardwareFault, WatchdogTripped
-            While a servo reports a hardware error, or the watchdog has stopped the head.
-        LineLost, NoReply, BadReply
-            If the servos do not confirm the goals.
+        Raises OutOfRange for an angle outside the limits, or a speed that is no positive number or slower
+        than a servo can be set to (0.024 rad/s of an X or MX, 0.001 of a P; its 0 means as fast as it can);
+        nothing moves. Speeds between are rounded down; HardwareFault, WatchdogTripped while a servo reports a
+        hardware error, or the watchdog has stopped the head; LineLost, NoReply, BadReply if the servos do not
+        confirm the goals.
         """
         axes = (self.settings.pan, self.settings.tilt)
         check_goal((pan_rad, tilt_rad), [axis.limits_rad for axis in axes], speed_rad_per_s)
@@ -104,13 +152,10 @@ class BusHead(PanTilt):
         broken off for it; a move that waits for its turn is not begun. After the watchdog has stopped the
         head this is the deliberate act that arms it anew.
 
-        Raises
-        ------
-        LineLost, NoReply, BadReply
-            If a servo did not confirm. The driver then keeps silent until its watchdog has stopped it, a
-            further stop included: both were commanded to brake when the line was given up, and every packet
-            more would feed the watchdog of one that did not hear it. With ``watchdog_s: 0`` nothing can be
-            fed: a stop tries a line that is away at once.
+        Raises LineLost, NoReply, BadReply if a servo did not confirm. The driver then keeps silent until its
+        watchdog has stopped it, a further stop included: both were commanded to brake when the line was given
+        up, and every packet more would feed the watchdog of one that did not hear it. With ``watchdog_s: 0``
+        nothing can be fed: a stop tries a line that is away at once.
         """
         away = None if self.settings.silence_s else self._stop_away
         self._call("stop", ServoSession.stop, first=True, away=away)
@@ -126,7 +171,7 @@ class BusHead(PanTilt):
         self._bus.close(self._close_now, CLOSE_TIMEOUT_S)
 
     def report(self) -> dict[str, AxisReport]:
-        """Return where each axis was sent and where it stood when it was last read; asks nobody."""
+        """Return where each axis was sent and where it stood when it was last read; queries no servo."""
         reports = {axis: motion.report() for axis, motion in zip(AXES, self._motions, strict=True)}
         return {axis: report for axis, report in reports.items() if report is not None}
 
@@ -185,22 +230,23 @@ class BusHead(PanTilt):
             if now_s >= self._absence.again_s:
                 self._come_back()
         elif now_s >= self._session.poll_due_s:
-            self._within(ServoSession.look)
+            self._within(ServoSession.update)
         return self._absence.again_s if self._session is None else self._session.poll_due_s
 
-    @abstractmethod
-    def _open(self) -> Any:
-        """Return the `ServoPair` of a line that is opened; nothing is set. Raises LineLost, BadReply."""
+    def _open(self) -> ServoPair:
+        """Open the line again; raises as `_opened`."""
+        return self._opened(self.settings, self._memory, self._clock, self._open_line, self._bus.urgent)
 
     @abstractmethod
-    def _watch(self, pair: Any) -> SessionWatch[Any]:
-        """Make both servos ready without moving them, and begin to watch them. Raises DriverError."""
+    def _watch(self, pair: Any) -> SessionWatch:
+        """Return the watch over both servos, which are ready."""
 
     def _connect(self) -> ServoSession:
         """Open the line, make both servos ready, and read them once."""
         head = self.settings
-        pair: ServoPair[Any, Any] = self._open()
+        pair = self._open()
         try:
+            pair.make_ready(goes_on=not head.silence_s)
             session = ServoSession(pair, self._watch(pair), head, self._stamps)
             session.poll_once()
         except BaseException as error:  # whatever it was goes on to the caller; the line is not left open
@@ -241,12 +287,12 @@ class BusHead(PanTilt):
         if self._bus.urgent():  # to open a network's line takes half a second
             raise Overtaken
         try:
-            pair: ServoPair[Any, Any] = self._open()
+            pair = self._open()
         except DriverError as error:
             self._absence.note(error, self._clock.now_s())
             raise
         try:
-            failed = confirmed(pair.axes, pair.stood, self._clock)
+            failed = confirmed(pair.axes, lambda axis: axis.servo.stood(), self._clock)
             if left_until_s is not None:
                 leave(pair, failed, left_until_s)
         finally:
@@ -264,7 +310,7 @@ class BusHead(PanTilt):
             if failed and not self.settings.silence_s:
                 stop_at_last(lambda: self._stop_away(until_s), self._clock, self.settings.port)
         except Overtaken:
-            words = (
+            message = (
                 "closing was broken off when its time was over: an axis may still move, or keep its torque"
             )
-            log.warning("%s: %s; 'mastctl stop --without-daemon' stops the head", self.settings.port, words)
+            log.warning("%s: %s; 'mastctl stop --without-daemon' stops the head", self.settings.port, message)

@@ -7,7 +7,8 @@ Every wait gives way to a stop; a stop itself goes out whatever is under way. Wh
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -27,12 +28,6 @@ class StatusPacket:
 
     Attributes
     ----------
-    servo_id
-        Of its sender.
-    error
-        Its error byte.
-    data
-        The requested bytes.
     refused
         Why the servo did not do as instructed; 0 if it did.
     alert
@@ -46,6 +41,33 @@ class StatusPacket:
     alert: bool
 
 
+@dataclass(frozen=True)
+class Register(ABC):
+    """One entry of a servo's table: ``size`` bytes at an address."""
+
+    name: str
+    address: int
+    size: int = 1
+
+    @abstractmethod
+    def decode(self, data: bytes) -> int:
+        """Return the value of the register's bytes."""
+
+    @abstractmethod
+    def encode(self, value: int) -> bytes:
+        """Return a value as the register's bytes; OverflowError if it does not fit."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """Neighbouring bytes of one servo's table: to be read, or with ``data`` to be written."""
+
+    servo_id: int
+    address: int
+    length: int
+    data: bytes = b""
+
+
 class Take(Protocol):
     """Takes packets out of what came in."""
 
@@ -54,23 +76,36 @@ class Take(Protocol):
         ...
 
 
+def at_header(buffer: bytearray, header: bytes) -> bool:
+    """Drop what comes before the next header; returns whether there is a whole one."""
+    start = buffer.find(header)
+    if start < 0:
+        begun = next(size for size in range(len(header) - 1, -1, -1) if buffer.endswith(header[:size]))
+        start = len(buffer) - begun
+    del buffer[:start]
+    return len(buffer) >= len(header)
+
+
 @dataclass(frozen=True)
 class PacketFormat:
     """What the packets of a family of servos look like.
 
     Attributes
     ----------
-    packet
-        Makes an instruction of a servo's id, the instruction and its parameters.
+    address_bytes
+        Of an address, and of a length beside it, little-endian.
+    instructions, refusals
+        What codes mean, for messages.
     to_nobody
         A write to no servo, which none obeys or answers: an adapter that gives it back echoes.
     """
 
     take: Take
     packet: Callable[[int, int, bytes], bytes]
-    read_parameters: Callable[[int, int], bytes]
+    address_bytes: int
+    group_write: Callable[[Sequence[Part]], bytes]
     status_bytes: int
-    words: Mapping[int, str]
+    instructions: Mapping[int, str]
     refusals: Mapping[int, str]
     to_nobody: bytes
 
@@ -78,12 +113,12 @@ class PacketFormat:
 class Overtaken(Exception):
     """What was under way on the line was broken off, since something more urgent wants it.
 
-    No `DriverError`: nobody on the way up may take it for a fault of the line and try again. Its words say
-    how far it had come.
+    No `DriverError`: no caller may treat it as a fault of the line and try again. Its message says how far it
+    had come.
     """
 
-    def __init__(self, words: str = "broken off") -> None:
-        super().__init__(words)
+    def __init__(self, message: str = "broken off") -> None:
+        super().__init__(message)
 
 
 class Port:
@@ -105,8 +140,6 @@ class Port:
     ----------
     suspect
         Whether a reply may still be under way: then it is listened until the line is quiet before sending.
-    deadline_s
-        Until when `receive` waits, seconds of the clock.
     echoes
         Whether the adapter gives back what is sent (half duplex): then that is dropped before a reply.
     """
@@ -209,7 +242,7 @@ class Port:
                 return status
 
     def comes_back(self, packet: bytes) -> bool:
-        """Send a packet that nobody answers; returns whether it comes back. Raises LineLost, BadReply."""
+        """Send a packet that none answers; returns whether it comes back. Raises LineLost, BadReply."""
         self.echoes = False
         self.send(packet, 0)
         until_s = self.clock.now_s() + QUIET_S + 2 * len(packet) * self.byte_s

@@ -10,21 +10,19 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from typing import Any
 
 from drivers.clock import Clock
-from drivers.errors import DriverError, LineLost, NoReply, WatchdogTripped
+from drivers.errors import BadReply, DriverError, LineLost, NoReply, WatchdogTripped
 from drivers.interfaces import Reading
 from drivers.servo_bus.pair import ServoAxis, ServoPair, SessionWatch
-from drivers.servo_bus.rest import Rest, rests
+from drivers.servo_bus.servo import Rest, rests
 from drivers.servo_bus.settings import HeadSettings
 
 log = logging.getLogger(__name__)
-Axis = ServoAxis[Any, Any]
 
 ATTEMPTS, PATIENCE_S = 3, 0.15  # of a poll, before it counts as failed
 FAILED_POLLS = 2  # in a row, before the servos are set up anew
-STOP_PATIENCE_S = 0.2  # how long a stop asks for a confirmation that does not come
+STOP_PATIENCE_S = 0.2  # how long a stop waits for a confirmation that does not come
 STANDS_S = 0.1
 LEFT_WITHIN_S = 1.2  # how long a closing waits for both axes to stand before their torque goes off
 
@@ -32,7 +30,7 @@ LEFT_WITHIN_S = 1.2  # how long a closing waits for both axes to stand before th
 class GivenUp(Exception):
     """The servos are not as this driver left them, or only silence can stop them: start anew.
 
-    Whoever owns the line closes it and raises ``error`` instead.
+    The owner of the line closes it and raises ``error`` instead.
     """
 
     def __init__(self, error: DriverError) -> None:
@@ -40,8 +38,13 @@ class GivenUp(Exception):
         self.error = error
 
 
+def distrusted(reason: str) -> GivenUp:
+    """Return what to raise where something changed the servos that was not this driver."""
+    return GivenUp(BadReply(f"{reason}: it restarted, or another program set it"))
+
+
 class ServoSession:
-    """One line's life; for the one thread that owns it.
+    """Two servos on one open line; for the one thread that owns it.
 
     Parameters
     ----------
@@ -54,9 +57,7 @@ class ServoSession:
         When the servos want to be read again, seconds of the line's clock.
     """
 
-    def __init__(
-        self, pair: ServoPair[Any, Axis], watch: SessionWatch[Axis], head: HeadSettings, clock: Clock
-    ) -> None:
+    def __init__(self, pair: ServoPair, watch: SessionWatch, head: HeadSettings, clock: Clock) -> None:
         self.pair = pair
         self.poll_due_s = 0.0
         self._head = head
@@ -66,17 +67,17 @@ class ServoSession:
         self._heard_s = -math.inf
         self._failed_polls = 0
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Read both servos and see whether they are as they should be.
 
         Raises GivenUp if the line is gone, polls failed again and again, or the servos have to be set up
         anew; NoReply, BadReply, Refused, WrongDevice if they cannot be read this time.
         """
         self._poll()
-        self._watch.look()
+        self._watch.check()
 
     def _poll(self) -> None:
-        """Poll both servos, repeating what a bad line spoilt; raises as `look`."""
+        """Poll both servos, repeating what a bad line spoilt; raises as `update`."""
         began_s = self._clock.now_s()
         for attempt in range(1, ATTEMPTS + 1):
             try:
@@ -115,8 +116,8 @@ class ServoSession:
             self.poll_due_s = now_s + self._head.resting_poll_s
 
     def read(self) -> Reading:
-        """Return what both servos measure now; raises as `look`."""
-        self.look()
+        """Return what both servos measure now; raises as `update`."""
+        self.update()
         now_s = self._clock.now_s()
         motions = [axis.motion for axis in self.pair.axes]
         samples = [motion.sample for motion in motions if motion.sample is not None]
@@ -133,47 +134,39 @@ class ServoSession:
     def move(self, angles_rad: Sequence[float], speed_rad_per_s: float) -> None:
         """Start both axes together towards angles within their limits.
 
-        Raises
-        ------
-        HardwareFault, WatchdogTripped
-            While a servo reports a hardware error, or the watchdog has stopped the head.
-        GivenUp
-            As `look`, and if the servos do not confirm the goals: silence stops them.
-        NoReply, BadReply, Refused, WrongDevice, LineLost
-            If they cannot be asked or set. Nothing moves, or where the goals were sent and then no answer
-            came, both were commanded to brake.
+        Raises HardwareFault, WatchdogTripped while a servo reports a hardware error, or the watchdog has
+        stopped the head; GivenUp as `update`, and if the servos do not confirm the goals: silence stops them;
+        NoReply, BadReply, Refused, WrongDevice, LineLost if they cannot be read or set. Nothing moves, or
+        where the goals were sent and then no answer came, both were commanded to brake.
         """
-        self.look()
+        self.update()
         self._watch.check_free()
         for axis in self.pair.axes:
             if not axis.motion.holds:
                 axis.take_hold()
                 self._watch.arm()
         self.poll_once()
-        speeds = [axis.settings.velocity_counts(speed_rad_per_s) for axis in self.pair.axes]
-        goals = [
+        for axis, angle_rad in zip(self.pair.axes, angles_rad, strict=True):
             axis.motion.plan(angle_rad, speed_rad_per_s, axis.acceleration_rad_per_s2)
-            for axis, angle_rad in zip(self.pair.axes, angles_rad, strict=True)
-        ]
         try:
-            self._send_goals(goals, speeds)
+            self._send_goals([axis.settings.velocity_counts(speed_rad_per_s) for axis in self.pair.axes])
         except DriverError:  # the caller assumes that it stands
             with suppress(LineLost):
                 self.pair.brake()
             raise
 
-    def _send_goals(self, goals: Sequence[int], speeds: Sequence[int]) -> None:
-        """Write profile and goal of both axes with one packet and see that they are held."""
+    def _send_goals(self, speeds: Sequence[int]) -> None:
+        """Write profile and goal of both axes with one packet and see that the servos have them."""
         motions = [axis.motion for axis in self.pair.axes]
         for _ in range(ATTEMPTS):
-            sent = self.pair.send_goals(goals, speeds)
+            sent = self.pair.send_goals(speeds)
             self._poll()
             stored = [motion.sample.values["goal_position"] for motion in motions if motion.sample]
             wanted = [motion.goal for motion in motions]  # a short first leg may have ended already
             if stored == list(sent) or stored == wanted:
                 return
-        self._watch.look_soon()
-        self._watch.look()
+        self._watch.check_soon()
+        self._watch.check()
         if self._watch.tripped:
             raise WatchdogTripped("the servos' bus watchdog stopped the head before the goals came")
         raise GivenUp(  # one axis may be under way: silence stops it
@@ -191,7 +184,7 @@ class ServoSession:
         if self._watch.tripped:
             self._watch.end_trip()
 
-    def _stop_each(self) -> dict[Axis, DriverError]:
+    def _stop_each(self) -> dict[ServoAxis, DriverError]:
         """Brake each axis by itself; returns those that did not confirm, and why."""
         try:
             self.pair.brake()
@@ -201,11 +194,12 @@ class ServoSession:
         axes = sorted(self.pair.axes, key=lambda axis: -axis.motion.heard_s)
         return confirmed(axes, self._confirm, self._clock)
 
-    def _confirm(self, axis: Axis) -> None:
-        """See that an axis brakes, or command it again; raises as `Pair.samples`, `Servo.set`."""
+    def _confirm(self, axis: ServoAxis) -> None:
+        """See that an axis brakes, or command it again; raises as `BusServo.sample_once` and
+        `BusServo.set`."""
         motion = axis.motion
         goal = motion.goal
-        sample = self.pair.sample(axis)
+        sample = axis.servo.sample_once()
         motion.take(sample)
         if sample.alert and motion.holds and not axis.servo.get("torque_enable"):
             motion.limp()
@@ -234,10 +228,10 @@ class ServoSession:
 
 
 def confirmed(
-    axes: Sequence[Axis], confirm: Callable[[Axis], object], clock: Clock
-) -> dict[Axis, DriverError]:
+    axes: Sequence[ServoAxis], confirm: Callable[[ServoAxis], object], clock: Clock
+) -> dict[ServoAxis, DriverError]:
     """Have each axis confirm a stop by itself, again for a while; returns those that did not, and why."""
-    failed: dict[Axis, DriverError] = {}
+    failed: dict[ServoAxis, DriverError] = {}
     until_s = clock.now_s() + STOP_PATIENCE_S
     waiting = list(axes)
     while waiting and (not failed or clock.now_s() < until_s):
@@ -252,7 +246,7 @@ def confirmed(
     return failed
 
 
-def leave(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError], until_s: float) -> None:
+def leave(pair: ServoPair, failed: Mapping[ServoAxis, DriverError], until_s: float) -> None:
     """Leave each axis that has confirmed the last stop as its ``at_close`` says. Raises `Overtaken` alone.
 
     Its torque goes off only when it stands. Each has until ``until_s`` of the line's clock for that, and at
@@ -266,21 +260,21 @@ def leave(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError], until_
         if limp:
             try:
                 within_s = max(until_s - pair.clock.now_s(), 2 * STANDS_S)
-                stands, sample = rests(axis.servo.look, pair.clock, within_s, Rest(STANDS_S))
-                limp = stands or not sample.values.get("torque_enable", True)
+                at_rest, sample = rests(axis.servo.sample, pair.clock, within_s, Rest(STANDS_S))
+                limp = at_rest or not sample.values.get("torque_enable", True)
                 if not limp:
                     log.warning("%s did not come to rest after a stop: its torque stays on", axis.servo.name)
             except DriverError as error:
                 limp = False
-                words = "%s keeps its torque, for it does not say whether it stands: %s"
-                log.warning(words, axis.servo.name, error)
+                message = "%s keeps its torque, for it does not say whether it is at rest: %s"
+                log.warning(message, axis.servo.name, error)
         axis.servo.release(limp)
 
 
-def stop_error(pair: ServoPair[Any, Axis], failed: Mapping[Axis, DriverError]) -> DriverError:
+def stop_error(pair: ServoPair, failed: Mapping[ServoAxis, DriverError]) -> DriverError:
     """Return the error of a stop that not every axis has confirmed."""
     error = next(iter(failed.values()))
     names = " and ".join(axis.servo.name for axis in failed)
     done = "".join(f"; {axis.servo.name} brakes" for axis in pair.axes if axis not in failed)
-    words = f"{names} did not confirm the stop and may still move: {error}{done}"
-    return type(error)(words, detail=error.detail)
+    message = f"{names} did not confirm the stop and may still move: {error}{done}"
+    return type(error)(message, detail=error.detail)

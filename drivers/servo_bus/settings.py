@@ -13,6 +13,7 @@ from calib.files.records import ABSENT, Text, problem
 from drivers.approach import ApproachedAxis
 from drivers.errors import BadOptions, WrongDevice
 from drivers.options import DriverOptions, ReadBy
+from drivers.servo_bus.port import Register
 
 STANDS_WITHIN_S = 0.5  # after this process has died: the last poll's age, the patience, and braking
 RESTING_POLL_S = 0.1  # of servos at rest: an idle computer stays idle
@@ -38,7 +39,7 @@ class CountedModel:
 
     name: str
     number: int | None
-    registers: Mapping[str, Any]
+    registers: Mapping[str, Register]
     low_count: int
     high_count: int
     centre_count: int

@@ -30,9 +30,7 @@ def _device(options: Mapping[str, Any], context: Context) -> PanTilt | Camera:
         return rover.pan_tilt
     if name not in rover.cameras:
         raise BadOptions(f"the simulated rover has no such camera{nearest(name, rover.cameras)}", device=name)
-    from drivers.sim.cameras import HangingCamera
-
-    return HangingCamera(rover.cameras[name], rover.sensor_modes[name], context.clock, rover.faults)
+    return rover.cameras[name]
 
 
 def _rover(context: Context) -> RoverModel:

@@ -88,14 +88,14 @@ class BenchBoard:
 def placed_board(placed: PlacedBoard, ground_z_m: Callable[[float, float], float]) -> BenchBoard:
     """Return a board of the configuration as it stands on the ground, whose z is ``ground_z_m(x_m, y_m)``."""
     heading, lean = placed.heading_rad, placed.lean_rad
-    looks = np.array(
+    ahead = np.array(
         [math.cos(heading) * math.cos(lean), math.sin(heading) * math.cos(lean), -math.sin(lean)]
     )
     right = np.array([math.sin(heading), -math.cos(heading), 0.0])
-    down = np.cross(-looks, right)
+    down = np.cross(-ahead, right)
     foot = np.array([placed.x_m, placed.y_m, ground_z_m(placed.x_m, placed.y_m) - placed.raised_m])
-    stands = Rigid(np.column_stack([right, down, -looks]), foot - 0.5 * placed.size_m[1] * down)
-    return BenchBoard(placed.face.board, stands, margin_m=placed.face.paper_m)
+    stands = Rigid(np.column_stack([right, down, -ahead]), foot - 0.5 * placed.size_m[1] * down)
+    return BenchBoard(placed.board, stands, margin_m=placed.paper_m)
 
 
 class BenchBoards:
@@ -134,9 +134,9 @@ class BenchBoards:
         image = self._renderer.image(camera, site_from_camera_frame, samples, rows)
         if not boards:
             return image
-        eye_m = site_from_camera_frame.points(camera.C)
+        camera_m = site_from_camera_frame.points(camera.C)
         far_first = sorted(
-            boards, key=lambda one: -float(np.linalg.norm(one.site_from_board.translation_m - eye_m))
+            boards, key=lambda one: -float(np.linalg.norm(one.site_from_board.translation_m - camera_m))
         )
         for board in far_first:
             board_from_frame = board.site_from_board.inverse @ site_from_camera_frame
@@ -184,8 +184,8 @@ class BenchBoards:
         by_row, by_column = (np.gradient(grid, axis=axis).reshape(-1, 2) for axis in (0, 1))
         front = directions[:, 2] > 0.0
         few = self._looked(board, hits, by_column, by_row, front, RIM)
-        told = few[0] + 1000.0 * few[1]
-        busy = np.flatnonzero(_uneven(told.reshape(*shape, len(RIM))))
+        seen = few[0] + 1000.0 * few[1]
+        busy = np.flatnonzero(_uneven(seen.reshape(*shape, len(RIM))))
         value, covered = few[..., 0].copy()
         for k in range(0, len(busy), RAYS_AT_ONCE // RAYS):
             some = busy[k : k + RAYS_AT_ONCE // RAYS]
@@ -230,20 +230,21 @@ class BenchBoards:
             return self._rays[key]
 
 
-def facing(eye_m: ArrayLike, position_m: ArrayLike, turned_rad: ArrayLike = (0.0, 0.0, 0.0)) -> Rigid:
-    """Return frame_from_board of a board at a place, upright and square to an eye, then turned about itself.
+def facing(camera_m: ArrayLike, position_m: ArrayLike, turned_rad: ArrayLike = (0.0, 0.0, 0.0)) -> Rigid:
+    """Return frame_from_board of a board at a place, upright and square to a camera, then turned about
+    itself.
 
-    Raises BadOptions if the board would be right over or under the eye, where nothing is upright.
+    Raises BadOptions if the board would be right over or under the camera, where nothing is upright.
 
     Parameters
     ----------
-    eye_m, position_m
+    camera_m, position_m
         (3,) metres in a frame whose z is down.
     turned_rad
         About the board's own x (its upper edge comes nearer), y (its right edge comes nearer) and z (it turns
-        to the right, as seen from the eye), z first.
+        to the right, as seen from the camera), z first.
     """
-    away = np.asarray(position_m, dtype=np.float64) - np.asarray(eye_m, dtype=np.float64)
+    away = np.asarray(position_m, dtype=np.float64) - np.asarray(camera_m, dtype=np.float64)
     right = np.cross([0.0, 0.0, 1.0], away)
     if float(np.linalg.norm(right)) < 1e-3:
         place = ", ".join(f"{value:.3f}" for value in np.asarray(position_m, dtype=np.float64))
@@ -270,12 +271,12 @@ def checked(name: str, board: BenchBoard, others: Collection[str]) -> BenchBoard
     return board
 
 
-def _uneven(told: Float64) -> NDArray[np.bool_]:
+def _uneven(seen: Float64) -> NDArray[np.bool_]:
     """Which pixels (h, w) see more than one colour at their middles, sides and corners (h, w, 4)."""
-    height, width = told.shape[:2]
+    height, width = seen.shape[:2]
     fine = np.empty((2 * height + 1, 2 * width + 1))
     for k, (dx, dy) in enumerate(RIM):
-        fine[int(2 * dy) + 1 : -1 : 2, int(2 * dx) + 1 : -1 : 2] = told[..., k]
+        fine[int(2 * dy) + 1 : -1 : 2, int(2 * dx) + 1 : -1 : 2] = seen[..., k]
     fine[-1], fine[:, -1] = fine[-2], fine[:, -2]
     least = ndimage.minimum_filter(fine, size=3)
     return np.asarray((ndimage.maximum_filter(fine, size=3) != least)[1::2, 1::2])

@@ -17,7 +17,7 @@ from drivers.sim.optics.exposure import ExposureSettings
 from drivers.sim.optics.lens import LensSettings
 
 _ROUNDING_S = 1e-9
-"""A frame stamped at the asked moment is not after it, whatever rounding does on the way."""
+"""A frame stamped at the requested moment is not after it, whatever rounding does on the way."""
 
 STEP_K = 1 / 16
 """Temperatures are taken in such steps, since every other camera model costs the renderer a table of rays: at

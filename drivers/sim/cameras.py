@@ -1,7 +1,7 @@
-"""Simulated cameras: frames at fixed instants, rendered only when somebody asks for one.
+"""Simulated cameras: frames at fixed instants, rendered only on request.
 
 Frame n of a camera is exposed at a fixed instant whether or not anybody looks, so its sequence number is a
-function of time and a frame that nobody fetched is a gap. All cameras of a rover share the instants, as with
+function of time and a frame that was not fetched is a gap. All cameras of a rover share the instants, as with
 a hardware trigger, unless a camera's clock says otherwise. A camera remembers as many finished frames as a
 capture ring would.
 """
@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
-from typing import Any
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -39,7 +38,7 @@ SHORTEST_S, LONGEST_SHARE = 1e-5, 0.99
 GAINS = 1.0, 64.0
 
 LOOKED_AGAIN_S = 0.5
-"""For a clock that is turned by hand: it wakes nobody."""
+"""For a clock that is turned by hand: it wakes no thread."""
 
 
 @dataclass(frozen=True)
@@ -67,17 +66,20 @@ class _Epoch:
 class SimulatedCamera(Camera):
     """One camera of the simulated rover; safe from any thread.
 
+    Each call may hang by a fault. It returns when that is over, also when the camera was closed meanwhile, as
+    a driver that waits for its kernel does.
+
     Parameters
     ----------
-    size_px
-        (width, height).
     expose
         ``expose(begin_s, exposure_s)`` gives the noise-free float32 (h, w) picture of an exposure, whose
         first row begins then; one that it keeps is read-only.
     taken
-        ``taken(sequence, mid_exposure_s)`` is told of every frame that is handed out, before it is.
+        ``taken(sequence, mid_exposure_s)`` is called with every frame that is handed out, before it is.
     start_s
         When the exposure of frame 0 begins: one value for all cameras of a rover.
+    metered
+        ``metered(time_s)``: a coarse noise-free picture of the moment, for an automatic exposure.
     """
 
     def __init__(
@@ -91,6 +93,8 @@ class SimulatedCamera(Camera):
         faults: FaultPanel,
         start_s: float,
         own: ClockSettings = ClockSettings(),  # noqa: B008  frozen
+        sensor_mode: SensorMode | None = None,
+        metered: Callable[[float], NDArray[np.float32]] | None = None,
     ) -> None:
         self.name = name
         self._settings = settings
@@ -108,11 +112,18 @@ class SimulatedCamera(Camera):
         noise = Noise(settings.read_noise_dn, settings.shot_noise_dn, settings.seed, name)
         self._readout = Readout(noise, settings.colour, settings.jpeg_quality)
         self._rolling_s = (size_px[1] - 1) * settings.row_time_s
-        # the begin of an exposure, told by its middle and length, comes back with another last bit
+        # the begin of an exposure, stated by its middle and length, comes back with another last bit
         self._rounding_s = 1e-9 if settings.row_time_s or settings.exposure.auto else 0.0
         self._exposure: FixedExposure | AutoExposure
-        self._exposure = FixedExposure(settings.exposure, settings.exposure_s, start_s)
+        if settings.exposure.auto and metered is not None:
+            first_s, now_s = self._epochs[0].start_s, clock.now_s
+            self._exposure = AutoExposure(settings.exposure, settings.exposure_s, first_s, metered, now_s)
+        else:
+            self._exposure = FixedExposure(settings.exposure, settings.exposure_s, start_s)
+        self._sensor_mode = sensor_mode
         self._closed = threading.Event()
+        self._changed = clock.signal()
+        faults.listen(self._wake)
 
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
         """Return the first frame stamped as exposed after ``exposed_after_s``, waiting for it if need be.
@@ -122,6 +133,7 @@ class SimulatedCamera(Camera):
         Raises NoFreshFrame if none came in time; the message says what came instead; NoReply under the fault
         ``intermittent``.
         """
+        self._hang(NEXT_FRAME)
         now_s = self._clock.now_s()
         deadline_s = now_s + max(0.0, timeout_s)
         if self._faults.strikes(self.name, now_s):
@@ -145,6 +157,7 @@ class SimulatedCamera(Camera):
 
     def settings(self) -> list[CameraSetting]:
         """Return exposure and gain; its focus stands fixed."""
+        self._hang(SETTINGS)
         fixed = isinstance(self._exposure, FixedExposure)
         exposure_s, gain = self._exposure.now if isinstance(self._exposure, FixedExposure) else (None, None)
         refusal = "" if fixed else "is set by simulation.cameras.exposure.auto"
@@ -159,10 +172,11 @@ class SimulatedCamera(Camera):
 
         Raises BadSetting for a camera that sets its exposure itself, and for a setting that it lacks.
         """
+        self._hang(SETTINGS)
         lacks = set(wanted) - {"exposure_s", "gain"}
         if lacks or not isinstance(self._exposure, FixedExposure):
-            words = f"the simulated camera has no {min(lacks)}" if lacks else "it sets its exposure itself"
-            raise BadSetting(words, device=self.name)
+            message = f"the simulated camera has no {min(lacks)}" if lacks else "it sets its exposure itself"
+            raise BadSetting(message, device=self.name)
         exposure_s, gain = self._exposure.now
         self._exposure.change(
             wanted.get("exposure_s", exposure_s), wanted.get("gain", gain), self._clock.now_s()
@@ -171,12 +185,47 @@ class SimulatedCamera(Camera):
 
     @property
     def info(self) -> CameraInfo:
-        """Its period at the rate of now; no trigger, since a fault may slow one camera's count."""
-        return CameraInfo(simulated=True, period_s=self._epoch(self._clock.now_s()).period_s)
+        """Its mode, and its period of now; no trigger, since a fault may slow one camera's count."""
+        self._hang(INFO)
+        mode = self._sensor_mode
+        size_px = None if mode is None else mode.size_px
+        return CameraInfo(True, size_px, mode, self._epoch(self._clock.now_s()).period_s)
+
+    def recent_times(self) -> Sequence[FrameTime]:
+        """Return no times: they are not kept."""
+        self._hang(RECENT_TIMES)
+        return ()
+
+    @contextmanager
+    def exposure_held(self) -> Iterator[None]:
+        """Return a context in which the exposure does not change."""
+        self._hang(EXPOSURE_HELD)
+        with self._exposure.held() if isinstance(self._exposure, AutoExposure) else nullcontext():
+            yield
 
     def close(self) -> None:
-        """Let go; a waiting call ends with NoFreshFrame within half a second."""
+        """Let go, as `end`."""
+        self._hang(CLOSE)
+        self.end()
+
+    def end(self) -> None:
+        """End a waiting call with NoFreshFrame within half a second; no fault hangs this."""
         self._closed.set()
+
+    def _hang(self, call: int) -> None:
+        """Wait until no fault holds this call."""
+        with self._changed:
+            while True:
+                now_s = self._clock.now_s()
+                fault = self._faults.find(self.name, "hang", now_s)
+                if fault is None or fault.number("call") not in (ANY, call):
+                    return
+                # Idle: that a call hangs makes no time pass where no other thread waits.
+                self._changed.wait(min(LOOKED_AGAIN_S, fault.end_s - now_s), idle=True)
+
+    def _wake(self) -> None:
+        with self._changed:
+            self._changed.notify_all()
 
     def _wanted(self, after_s: float, now_s: float) -> tuple[int, _Epoch]:
         """The frame that the call is about, with its epoch."""
@@ -229,8 +278,8 @@ class SimulatedCamera(Camera):
                 image.setflags(write=False)
                 begin_s, all_rows_s = epoch.begin_s(sequence), shot.exposure_s + self._rolling_s
                 stamp_s = self._own.stamp_s(begin_s) + all_rows_s / 2
-                told = {"exposure_s": shot.exposure_s, "gain": shot.gain}
-                self._last = Frame(image, sequence, stamp_s, all_rows_s, settings=told)
+                settings = {"exposure_s": shot.exposure_s, "gain": shot.gain}
+                self._last = Frame(image, sequence, stamp_s, all_rows_s, settings=settings)
                 self._taken(sequence, begin_s + all_rows_s / 2)
             return self._last
 
@@ -268,7 +317,7 @@ class SimulatedCamera(Camera):
         """What to say when no fresh frame came."""
         if self._closed.is_set():
             return "it is closed"
-        message = f"no frame exposed after the asked moment came within {timeout_s:.3g} s"
+        message = f"no frame exposed after the requested moment came within {timeout_s:.3g} s"
         now_s = self._clock.now_s()
         if stuck := self._faults.find(self.name, "stuck", now_s):
             epoch = self._epoch(now_s)
@@ -279,114 +328,3 @@ class SimulatedCamera(Camera):
             return f"{message}; none came at all"
         age_s = exposed_after_s - (self._last.mid_exposure_s - self._last.exposure_s / 2)
         return f"{message}; the last one is frame {self._last.sequence}, exposed {age_s:.3f} s before"
-
-
-class SelfExposedCamera(SimulatedCamera):
-    """One with an automatic exposure.
-
-    Parameters
-    ----------
-    metered
-        ``metered(time_s)``: a coarse noise-free picture of the moment.
-    others
-        As `SimulatedCamera` takes them.
-    """
-
-    def __init__(self, metered: Callable[[float], NDArray[np.float32]], *others: Any) -> None:
-        super().__init__(*others)
-        settings, start_s = self._settings, self._epochs[0].start_s
-        self._automatic = AutoExposure(
-            settings.exposure, settings.exposure_s, start_s, metered, self._clock.now_s
-        )
-        self._exposure = self._automatic
-
-    def exposure_held(self) -> AbstractContextManager[None]:
-        """Return a context in which the exposure does not change."""
-        return self._automatic.held()
-
-
-class HangingCamera(Camera):
-    """A simulated camera as the service has it: every call a camera can have, and each can hang.
-
-    A call that hangs returns when the fault is over, also when the camera was closed meanwhile, as a driver
-    that waits for its kernel does.
-
-    Parameters
-    ----------
-    camera
-        The camera behind it; its own calls do not hang.
-    sensor_mode
-        Which pixels of its sensor its pictures show.
-    """
-
-    def __init__(
-        self, camera: SimulatedCamera, sensor_mode: SensorMode, clock: Clock, faults: FaultPanel
-    ) -> None:
-        self._camera = camera
-        self._sensor_mode = sensor_mode
-        self._clock = clock
-        self._faults = faults
-        self._changed = clock.signal()
-        faults.listen(self._wake)
-
-    @property
-    def name(self) -> str:
-        """The camera's name, also the device name of its faults."""
-        return self._camera.name
-
-    def next_frame(self, exposed_after_s: float, timeout_s: float) -> Frame:
-        """Return the next frame, as the camera behind it."""
-        self._hang(NEXT_FRAME)
-        return self._camera.next_frame(exposed_after_s, timeout_s)
-
-    def close(self) -> None:
-        """Let go."""
-        self._hang(CLOSE)
-        self._camera.close()
-
-    def settings(self) -> Sequence[CameraSetting]:
-        """Return its settings, as the camera behind it."""
-        self._hang(SETTINGS)
-        return self._camera.settings()
-
-    def adjust(self, wanted: Mapping[str, float]) -> Sequence[str]:
-        """Change some of them, as the camera behind it."""
-        self._hang(SETTINGS)
-        return self._camera.adjust(wanted)
-
-    @property
-    def info(self) -> CameraInfo:
-        """That of the camera behind it, and which pixels of its sensor its pictures show."""
-        self._hang(INFO)
-        mode = self._sensor_mode
-        return replace(self._camera.info, size_px=mode.size_px, sensor_mode=mode)
-
-    def recent_times(self) -> Sequence[FrameTime]:
-        """Return the times of recent frames, as the camera behind it."""
-        self._hang(RECENT_TIMES)
-        return self._camera.recent_times()
-
-    def exposure_held(self) -> AbstractContextManager[None]:
-        """Return a context in which the exposure does not change."""
-        return self._held()
-
-    @contextmanager
-    def _held(self) -> Iterator[None]:
-        self._hang(EXPOSURE_HELD)
-        with self._camera.exposure_held():
-            yield
-
-    def _hang(self, call: int) -> None:
-        """Wait until no fault holds this call."""
-        with self._changed:
-            while True:
-                now_s = self._clock.now_s()
-                fault = self._faults.find(self.name, "hang", now_s)
-                if fault is None or fault.number("call") not in (ANY, call):
-                    return
-                # Idle: that a call hangs makes no time pass where nobody else waits.
-                self._changed.wait(min(LOOKED_AGAIN_S, fault.end_s - now_s), idle=True)
-
-    def _wake(self) -> None:
-        with self._changed:
-            self._changed.notify_all()

@@ -4,33 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
+
+from pydantic import Field
 
 from calib.geometry.rig import JointErrors
 from drivers.errors import BadOptions
-from drivers.faults import nearest
-from drivers.options import is_number
+from drivers.options import DriverOptions, one_of, read_options
 from drivers.sim.axis import AxisSettings
 
-ZERO_ALLOWED = ("backlash_rad", "approach_rad", "sag_rad")
-_TILT_ONLY = ("sag_rad", "gravity_turnover_rad", "gravity_friction")
-BOUNDS: Mapping[str, tuple[float, float]] = {
-    "gravity_turnover_rad": (-math.pi, math.pi),
-    "gravity_friction": (0.0, 1.0),
-    "ring_hz": (0.0, 100.0),
-    "ring_damping": (0.001, 0.9),
-    "ring_gain": (0.0, 10.0),
-    "settle_s": (0.0, 5.0),
-}
-HEAD_KEYS = frozenset(
-    {f.name for f in fields(AxisSettings)} - {"low_rad", "high_rad", "harmonics_rad"}
-    | {"pan_harmonics_rad", "tilt_harmonics_rad"}
-)
 SLOWEST_DECAY_PER_S = 0.3
 """Ringing has to be over before the minute that an axis remembers is."""
 
 MOST_HARMONICS, HARMONIC_RAD = 4, 0.05
+PRESET_NAMES = ("ptu_d46_70", "dynamixel_x", "ph42")
 
 
 ARCSEC = math.radians(1 / 3600)
@@ -66,49 +54,45 @@ _PH42 = replace(
 )
 
 
-def axis_changes(values: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return what ``simulation.head`` changes in pan and in tilt. Raises BadOptions."""
-    pan: dict[str, Any] = {}
-    tilt: dict[str, Any] = {}
-    for name, value in values.items():
-        if name not in HEAD_KEYS:
-            raise BadOptions(f"simulation.head has no key {name!r}{nearest(str(name), HEAD_KEYS)}")
-        if name.endswith("harmonics_rad"):
-            (pan if name.startswith("pan") else tilt)["harmonics_rad"] = _harmonics(name, value)
-            continue
-        number = _number(name, value)
-        tilt[name] = number
-        if name not in _TILT_ONLY:
-            pan[name] = number
-    return pan, tilt
+_Length = Annotated[float, Field(ge=0.0, le=1e3)]
+_Positive = Annotated[float, Field(gt=0.0, le=1e6)]
+_Part = Annotated[float, Field(ge=-HARMONIC_RAD, le=HARMONIC_RAD)]
+_Harmonics = Annotated[
+    list[Annotated[list[_Part], Field(min_length=2, max_length=2)]], Field(max_length=MOST_HARMONICS)
+]
+_TILT_ONLY = ("sag_rad", "gravity_turnover_rad", "gravity_friction")
 
 
-def _number(name: str, value: Any) -> float:
-    """A number of the head, within its bounds."""
-    low, high = BOUNDS.get(name, (0.0, math.inf))
-    if name in BOUNDS:
-        if not is_number(value) or not low <= value <= high:
-            raise BadOptions(
-                f"simulation.head.{name} is {value!r}, expected a number from {low:g} to {high:g}"
-            )
-        return float(value)
-    if not is_number(value) or value < 0 or (value == 0 and name not in ZERO_ALLOWED):
-        raise BadOptions(f"simulation.head.{name} is {value!r}, expected a positive number")
-    return float(value)
+class HeadOptions(DriverOptions):
+    """What a configuration changes in a preset: fields of `AxisSettings`, and what the encoders are wrong
+    by."""
 
+    preset: Annotated[str, one_of(PRESET_NAMES)] = PRESET_NAMES[0]
+    count_rad: _Positive | None = None
+    speed_rad_per_s: _Positive | None = None
+    acceleration_rad_per_s2: _Positive | None = None
+    backlash_rad: _Length | None = None
+    approach_rad: _Length | None = None
+    sag_rad: _Length | None = None
+    gravity_turnover_rad: Annotated[float, Field(ge=-math.pi, le=math.pi)] | None = None
+    gravity_friction: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
+    ring_hz: Annotated[float, Field(ge=0.0, le=100.0)] | None = None
+    ring_damping: Annotated[float, Field(ge=0.001, le=0.9)] | None = None
+    ring_gain: Annotated[float, Field(ge=0.0, le=10.0)] | None = None
+    settle_s: Annotated[float, Field(ge=0.0, le=5.0)] | None = None
+    pan_harmonics_rad: _Harmonics | None = None
+    tilt_harmonics_rad: _Harmonics | None = None
 
-def _harmonics(name: str, value: Any) -> tuple[tuple[float, float], ...]:
-    """Cosine and sine parts of the first harmonics."""
-    expected = f"expected up to {MOST_HARMONICS} pairs [cosine, sine], each part within {HARMONIC_RAD:g} rad"
-    if not isinstance(value, list | tuple) or len(value) > MOST_HARMONICS:
-        raise BadOptions(f"simulation.head.{name} is {value!r}, {expected}")
-    for pair in value:
-        if not isinstance(pair, list | tuple) or len(pair) != 2:
-            raise BadOptions(f"simulation.head.{name} holds {pair!r}, {expected}")
-        for part in pair:
-            if not is_number(part) or abs(part) > HARMONIC_RAD:
-                raise BadOptions(f"simulation.head.{name} holds {part!r}, {expected}")
-    return tuple((float(cosine), float(sine)) for cosine, sine in value)
+    def changes(self, axis: str) -> dict[str, Any]:
+        """Return what changes in the settings of ``pan`` or ``tilt``."""
+        given = self.model_dump(
+            exclude={"preset", "pan_harmonics_rad", "tilt_harmonics_rad"}, exclude_none=True
+        )
+        found = {name: value for name, value in given.items() if axis == "tilt" or name not in _TILT_ONLY}
+        harmonics = self.pan_harmonics_rad if axis == "pan" else self.tilt_harmonics_rad
+        if harmonics is not None:
+            found["harmonics_rad"] = tuple((cosine, sine) for cosine, sine in harmonics)
+        return found
 
 
 def check_together(axis: AxisSettings) -> None:
@@ -164,24 +148,15 @@ PRESETS: Mapping[str, HeadModel] = {
 def head_settings(value: Any) -> HeadModel:
     """Return the head that a configuration names.
 
-    Raises BadOptions for an unknown preset or key, a value that is not a number of the right sign or within
-    its bounds, or values that do not go together.
-
-    Parameters
-    ----------
-    value
-        A preset's name, or a mapping with ``preset`` and any of ``count_rad``, ``backlash_rad``,
-        ``approach_rad``, ``speed_rad_per_s``, ``acceleration_rad_per_s2``, ``ring_hz``, ``ring_damping``,
-        ``ring_gain``, ``settle_s`` (both axes), ``sag_rad``, ``gravity_turnover_rad``, ``gravity_friction``
-        (tilt), ``pan_harmonics_rad`` and ``tilt_harmonics_rad``.
+    Raises BadOptions for a key or value that cannot be, or values that do not go together. ``value`` is a
+    preset's name, or a mapping (`HeadOptions`).
     """
-    changes = dict(value) if isinstance(value, Mapping) else {"preset": value}
-    preset = changes.pop("preset", "ptu_d46_70")
-    if not isinstance(preset, str) or preset not in PRESETS:
-        raise BadOptions(f"simulation.head: there is no head {preset!r}{nearest(preset, PRESETS)}")
-    pan, tilt = axis_changes(changes)
-    head = PRESETS[preset]
-    head = replace(head, pan=replace(head.pan, **pan), tilt=replace(head.tilt, **tilt))
+    changed = read_options(
+        HeadOptions, value if isinstance(value, Mapping) else {"preset": value}, place="simulation.head"
+    )
+    head = PRESETS[changed.preset]
+    pan, tilt = (replace(getattr(head, axis), **changed.changes(axis)) for axis in ("pan", "tilt"))
+    head = replace(head, pan=pan, tilt=tilt)
     for axis in (head.pan, head.tilt):
         check_together(axis)
     return head

@@ -2,7 +2,7 @@
 
 A ``Leg`` is one profile: from a position and velocity at a moment to rest at a goal, with bounds on speed
 and acceleration. A ``Motion`` is the history of legs, so that the position at a past moment (the middle of
-an exposure) can be asked for. Both are frozen: a new command gives a new ``Motion``.
+an exposure) can be queried. Both are frozen: a new command gives a new ``Motion``.
 """
 
 from __future__ import annotations

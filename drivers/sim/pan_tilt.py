@@ -50,7 +50,7 @@ after the last packet."""
 
 @dataclass(frozen=True)
 class _Wire:
-    """What stands behind a head of a name: which simulator's model, and which the driver is told."""
+    """What stands behind a head of a name: which simulator's model, and the driver's name for it."""
 
     wire: str
     simulated: str
@@ -88,11 +88,6 @@ class SimulatedPanTilt(PanTilt):
     """A head in memory; safe from any thread.
 
     A new goal while under way replaces the old one without a jump in position or velocity.
-
-    Parameters
-    ----------
-    faults
-        The panel that is asked for faults of ``pan_tilt``; none when left out.
     """
 
     def __init__(self, head: HeadModel, clock: Clock, faults: FaultPanel | None = None) -> None:
@@ -218,7 +213,8 @@ class SimulatedPanTilt(PanTilt):
         return (2 * value - 1) * (1e6 if kind < 0.6 else math.pi)
 
     def _call(self, action: Callable[[float], _T]) -> _T:
-        """Do what a caller asked, at the moment of the call; then let the answer fail if a fault says so."""
+        """Do what a caller requests, at the moment of the call; then let the answer fail if a fault says
+        so."""
         faults, name = self._faults, self.head.name
         with self._lock:
             now_s = self._clock.now_s()
@@ -253,14 +249,10 @@ class WiredHead:
 
     Parameters
     ----------
-    wire
-        A key of ``DEFAULT_HEADS``.
     head
         What it is made of; its approach is done by the driver.
     clock
         What simulator, line and driver live on: the machine's own or the simulation's, none turned by hand.
-    faults
-        Those of ``pan_tilt`` act on the axes and on the line.
     """
 
     def __init__(self, wire: str, head: HeadModel, clock: Clock, faults: FaultPanel) -> None:

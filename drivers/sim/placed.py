@@ -6,19 +6,19 @@ Places are in the site frame (x north, y east), which is the rover frame as long
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
+from calib.files.records import ABSENT, problem
 from calib.geometry.rig import Rig
 from calib.targets.boards import Charuco, DotBoard
 from drivers.errors import BadOptions
-from drivers.faults import nearest
-from drivers.options import check_bounds, filled
+from drivers.options import DriverOptions, ReadBy, is_whole, one_of, read_options
 
 Float64 = NDArray[np.float64]
 
@@ -32,37 +32,82 @@ CLEAR_M = 0.05  # beyond the cameras' reach
 DICTIONARIES = {name: getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")}
 
 
-@dataclass(frozen=True)
-class PlacedRock:
+class _Placed(DriverOptions):
+    """A thing's place in the site frame."""
+
+    x_m: Annotated[float, Field(ge=-REACH_M, le=REACH_M)]
+    """North."""
+    y_m: Annotated[float, Field(ge=-REACH_M, le=REACH_M)]
+    """East."""
+
+
+_Heading = Annotated[float, Field(ge=-2 * math.pi, le=2 * math.pi)]
+_Side = Annotated[float, Field(ge=0.02, le=3.0)]
+_Count = Annotated[int, Field(ge=2, le=50)]
+_Spacing = Annotated[float, Field(ge=0.005, le=1.0)]
+_Mark = Annotated[float, Field(ge=0.002, le=1.0)]
+_Margin = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class PlacedRock(_Placed):
     """A stone: where, how wide, how it is turned; its shape is of the scene's seed and its place."""
 
-    x_m: float = math.nan
-    y_m: float = math.nan
-    diameter_m: float = 0.3
-    heading_rad: float = 0.0
+    diameter_m: Annotated[float, Field(ge=0.03, le=3.0)] = 0.3
+    heading_rad: _Heading = 0.0
 
 
-@dataclass(frozen=True)
-class PlacedBrick:
+class PlacedBrick(_Placed):
     """A box level on the ground; its length points along the heading."""
 
-    x_m: float = math.nan
-    y_m: float = math.nan
-    heading_rad: float = 0.0
-    length_m: float = 0.39
-    width_m: float = 0.19
-    height_m: float = 0.19
+    heading_rad: _Heading = 0.0
+    length_m: _Side = 0.39
+    width_m: _Side = 0.19
+    height_m: _Side = 0.19
 
 
-@dataclass(frozen=True)
-class PlacedDots:
+class PlacedBoard(_Placed):
+    """A board: the middle of its lower edge over (x, y), ``raised_m`` over the ground.
+
+    Its face looks along the heading (by default towards the site's origin), ``lean_rad`` upwards.
+    """
+
+    heading_rad: _Heading = ABSENT
+    lean_rad: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
+    raised_m: Annotated[float, Field(ge=0.0, le=3.0)] = 0.0
+    rows: _Count = 10
+    columns: _Count = 10
+
+    @property
+    def board(self) -> DotBoard | Charuco:
+        """What is printed."""
+        raise NotImplementedError
+
+    @property
+    def paper_m(self) -> float:
+        """White paper around the print."""
+        raise NotImplementedError
+
+    @property
+    def size_m(self) -> Float64:
+        """Width and height with the white paper, (2,)."""
+        return np.array(self.board.size_m) + 2 * self.paper_m
+
+    def _check(self) -> None:
+        """Set the usual heading, and refuse a board of no usual size."""
+        if self.heading_rad is None:
+            object.__setattr__(self, "heading_rad", math.atan2(-self.y_m, -self.x_m))
+        width, height = self.size_m
+        if not 0.05 <= max(width, height) <= 4.0:
+            raise problem("", f"{width:g} x {height:g} m where 0.05 to 4 m is expected")
+
+
+class PlacedDots(PlacedBoard):
     """Round dots in rows and columns, as of a survey's board; the margin is from the outer dots' centres."""
 
-    rows: int = 10
-    columns: int = 10
-    spacing_m: float = 0.08
-    dot_diameter_m: float = 0.04
-    margin_m: float = 0.08
+    kind: Literal["dots"] = "dots"
+    spacing_m: _Spacing = 0.08
+    dot_diameter_m: _Mark = 0.04
+    margin_m: _Margin = 0.08
 
     @property
     def board(self) -> DotBoard:
@@ -74,17 +119,29 @@ class PlacedDots:
         """White paper around the print."""
         return self.margin_m - self.dot_diameter_m / 2
 
+    @model_validator(mode="after")
+    def _check_face(self) -> Self:
+        diameter_m = self.dot_diameter_m
+        if not diameter_m < self.spacing_m:
+            less = f"less than spacing_m, {self.spacing_m!r}"
+            raise problem("dot_diameter_m", f"{diameter_m!r} where {less}, is expected")
+        if not self.margin_m >= diameter_m / 2:
+            least = f"half a dot at least, {diameter_m / 2:g}"
+            raise problem("margin_m", f"{self.margin_m!r} where {least}, is expected")
+        self._check()
+        return self
 
-@dataclass(frozen=True)
-class PlacedCharuco:
+
+class PlacedCharuco(PlacedBoard):
     """A ChArUco board of OpenCV: squares in rows and columns, markers of a dictionary in the white ones."""
 
-    rows: int = 7
-    columns: int = 10
-    square_m: float = 0.08
-    marker_m: float = 0.06
-    dictionary: str = "DICT_5X5_100"
-    margin_m: float = 0.02
+    kind: Literal["charuco"] = "charuco"
+    rows: _Count = 7
+    columns: _Count = 10
+    square_m: _Spacing = 0.08
+    marker_m: _Mark = 0.06
+    dictionary: Annotated[str, one_of(DICTIONARIES)] = "DICT_5X5_100"
+    margin_m: _Margin = 0.02
 
     @property
     def board(self) -> Charuco:
@@ -96,122 +153,51 @@ class PlacedCharuco:
         """White paper around the print."""
         return self.margin_m
 
-
-FACES: Mapping[str, Any] = {"dots": PlacedDots(), "charuco": PlacedCharuco()}
-
-
-@dataclass(frozen=True)
-class PlacedBoard:
-    """A board: the middle of its lower edge over (x, y), ``raised_m`` over the ground.
-
-    Its face looks along the heading (by default towards the site's origin), ``lean_rad`` upwards.
-    """
-
-    x_m: float = math.nan
-    y_m: float = math.nan
-    heading_rad: float = math.nan
-    lean_rad: float = 0.0
-    raised_m: float = 0.0
-    face: PlacedDots | PlacedCharuco = PlacedDots()
-
-    @property
-    def size_m(self) -> Float64:
-        """Width and height with the white paper, (2,)."""
-        return np.array(self.face.board.size_m) + 2 * self.face.paper_m
+    @model_validator(mode="after")
+    def _check_face(self) -> Self:
+        if not self.marker_m < self.square_m:
+            less = f"less than square_m, {self.square_m!r}"
+            raise problem("marker_m", f"{self.marker_m!r} where {less}, is expected")
+        markers = self.rows * self.columns // 2
+        holds = len(cv2.aruco.getPredefinedDictionary(DICTIONARIES[self.dictionary]).bytesList)
+        if markers > holds:
+            squares = f"{self.rows} x {self.columns} squares need {markers} markers"
+            raise problem("", f"{squares}, {self.dictionary} has {holds}")
+        self._check()
+        return self
 
 
 Placed = PlacedRock | PlacedBrick | PlacedBoard
-
-_ANGLE = (-2 * math.pi, 2 * math.pi)
-_PLACE = {"x_m": (-REACH_M, REACH_M), "y_m": (-REACH_M, REACH_M), "heading_rad": _ANGLE}
-BOUNDS: Mapping[type, Mapping[str, tuple[float, float]]] = {
-    PlacedRock: {**_PLACE, "diameter_m": (0.03, 3.0)},
-    PlacedBrick: {**_PLACE, "length_m": (0.02, 3.0), "width_m": (0.02, 3.0), "height_m": (0.02, 3.0)},
-    PlacedBoard: {**_PLACE, "lean_rad": (-1.0, 1.0), "raised_m": (0.0, 3.0)},
-    PlacedDots: {
-        "rows": (2, 50), "columns": (2, 50), "spacing_m": (0.005, 1.0), "dot_diameter_m": (0.002, 1.0),
-        "margin_m": (0.0, 1.0),
-    },
-    PlacedCharuco: {
-        "rows": (2, 50), "columns": (2, 50), "square_m": (0.005, 1.0), "marker_m": (0.002, 1.0),
-        "margin_m": (0.0, 1.0),
-    },
+KINDS: Mapping[str, type[Placed]] = {
+    "rocks": PlacedRock, "bricks": PlacedBrick, "dots": PlacedDots, "charuco": PlacedCharuco
 }  # fmt: skip
 
 
-def read_list(kind: str, values: Sequence[Any]) -> tuple[Any, ...]:
-    """Return the placed rocks, bricks or boards of ``simulation.scene``.
+def placed_or(kind: str, most: int = 0) -> ReadBy:
+    """Return what annotates placed rocks, bricks or boards, or how many are scattered, up to ``most``."""
 
-    Raises BadOptions with the place in the configuration, the value, and what would be right.
-    """
-    key = f"simulation.scene.{kind}"
-    if len(values) > MOST[kind]:
-        raise BadOptions(f"{key} are {len(values)}, expected {MOST[kind]} at most")
-    return tuple(_one(kind, value, f"{key}[{k}]") for k, value in enumerate(values))
+    def read(value: Any) -> int | tuple[Placed, ...]:
+        key = f"simulation.scene.{kind}"
+        if isinstance(value, list | tuple):
+            if len(value) > MOST[kind]:
+                raise BadOptions(f"{key} are {len(value)}, expected {MOST[kind]} at most")
+            return tuple(_one(kind, one, f"{key}[{k}]") for k, one in enumerate(value))
+        if not most or not is_whole(value) or not 0 <= value <= most:
+            number = f"a number from 0 to {most} or " if most else ""
+            raise BadOptions(f"{key} is {value!r}, expected {number}a list")
+        return value
+
+    return ReadBy(read)
 
 
 def _one(kind: str, value: Any, key: str) -> Placed:
+    if isinstance(value, PlacedRock | PlacedBrick | PlacedBoard):
+        return value
     if not isinstance(value, Mapping):
         raise BadOptions(f"{key} is {value!r}, expected keys and values, as {{x_m: 5, y_m: 0}}")
-    for needed in ("x_m", "y_m"):
-        if needed not in value:
-            raise BadOptions(f"{key} has no {needed}; metres in the site frame are expected")
-    if kind == "boards":
-        return _board(dict(value), key)
-    thing: Placed = filled(PlacedRock() if kind == "rocks" else PlacedBrick(), value, key)
-    check_bounds(thing, BOUNDS[type(thing)], key)
-    return thing
-
-
-def _board(value: dict[str, Any], key: str) -> PlacedBoard:
-    """A board's place, and its face by the kind."""
-    kind = value.pop("kind", "dots")
-    if kind not in FACES:
-        raise BadOptions(f"{key}.kind is {kind!r}{nearest(str(kind), FACES)}")
-    own = {f.name for f in fields(PlacedBoard)} - {"face"}
-    known = {f.name for f in fields(FACES[kind])}
-    for name in value:
-        if name not in own | known:
-            raise BadOptions(f"{key} has no key {name!r} for kind {kind!r}{nearest(str(name), own | known)}")
-    face = filled(FACES[kind], {k: v for k, v in value.items() if k in known}, key)
-    check_bounds(face, BOUNDS[type(face)], key)
-    _check_face(face, key)
-    plain: PlacedBoard = filled(PlacedBoard(), {k: v for k, v in value.items() if k in own}, key)
-    board = replace(plain, face=face)
-    if math.isnan(board.heading_rad) and "heading_rad" not in value:
-        board = replace(board, heading_rad=math.atan2(-board.y_m, -board.x_m))
-    check_bounds(board, BOUNDS[PlacedBoard], key)
-    if not 0.05 <= board.size_m.max() <= 4.0:
-        raise BadOptions(f"{key} is {board.size_m[0]:g} x {board.size_m[1]:g} m, expected 0.05 to 4 m")
-    return board
-
-
-def _check_face(face: PlacedDots | PlacedCharuco, key: str) -> None:
-    """What two values of a face must be to each other."""
-    if isinstance(face, PlacedDots) and not face.dot_diameter_m < face.spacing_m:
-        raise BadOptions(
-            f"{key}.dot_diameter_m is {face.dot_diameter_m!r}, expected less than spacing_m, "
-            f"{face.spacing_m!r}"
-        )
-    if isinstance(face, PlacedDots) and not face.margin_m >= face.dot_diameter_m / 2:
-        raise BadOptions(
-            f"{key}.margin_m is {face.margin_m!r}, expected half a dot at least, {face.dot_diameter_m / 2:g}"
-        )
-    if isinstance(face, PlacedCharuco):
-        if not face.marker_m < face.square_m:
-            raise BadOptions(
-                f"{key}.marker_m is {face.marker_m!r}, expected less than square_m, {face.square_m!r}"
-            )
-        if face.dictionary not in DICTIONARIES:
-            raise BadOptions(
-                f"{key}.dictionary is {face.dictionary!r}{nearest(face.dictionary, DICTIONARIES)}"
-            )
-        holds = len(cv2.aruco.getPredefinedDictionary(DICTIONARIES[face.dictionary]).bytesList)
-        if face.rows * face.columns // 2 > holds:
-            raise BadOptions(
-                f"{key}: {face.rows} x {face.columns} squares need {face.rows * face.columns // 2} markers, "
-                f"{face.dictionary} has {holds}"
-            )
+    if kind == "boards" and (kind := value.get("kind", "dots")) not in ("dots", "charuco"):
+        raise BadOptions(f"{key}.kind: {kind!r} where one of dots, charuco is expected")
+    return read_options(KINDS[kind], value, place=key)
 
 
 def footprint_m(thing: Placed) -> Float64:

@@ -34,7 +34,7 @@ from drivers.faults import FaultPanel, nearest
 from drivers.interfaces import PanTilt
 from drivers.sim.bench_boards import BenchBoard, BenchBoards, checked, facing, placed_board
 from drivers.sim.camera_settings import ClockSettings
-from drivers.sim.cameras import SelfExposedCamera, SimulatedCamera
+from drivers.sim.cameras import SimulatedCamera
 from drivers.sim.heads import with_joints
 from drivers.sim.kept_scenes import kept_scene
 from drivers.sim.optics.lens import SimulatedLens
@@ -57,7 +57,7 @@ MOVING_PX = 4
 BLUR_STEPS = 5
 """...and is the mean of one view for each of these that it moves by, of so many at most."""
 
-GIVES_WAY_S = 0.05  # between two pictures that nobody has asked for yet
+GIVES_WAY_S = 0.05  # between two pictures that are not requested yet
 RESTS_RAD = 1e-7
 """A head that turns less during a picture rests."""
 
@@ -110,7 +110,7 @@ class RoverModel:
         self.scene: Scene = kept_scene(settings.scene)
         placed = [placed_board(board, self.scene.ground_z_m) for board in settings.scene.boards]
         self._renderer = BenchBoards(Renderer(self.scene), placed)
-        # Before any camera is asked: a frame's deadline is no time for a compiler.
+        # Before any camera is queried: a frame's deadline is no time for a compiler.
         compile_renderer()
         self._stills = Stills(self._renderer)
         self._render_lock = threading.Lock()
@@ -289,12 +289,12 @@ class RoverModel:
         return pixels
 
     def draw_ahead(self, time_s: float) -> None:
-        """Draw what each camera sees at a moment, so that its first picture is there when it is asked for.
+        """Draw what each camera sees at a moment, so that its first picture is there when it is requested.
 
-        What is asked for meanwhile waits for one picture at most. Ends early when the rover is closed.
+        What is requested meanwhile waits for one picture at most. Ends early when the rover is closed.
         """
         for name in self.cameras:
-            # Where a lock is let go and taken at once, whoever waits for it would go on waiting.
+            # Where a lock is let go and taken at once, a thread that waits for it would go on waiting.
             if self._closing.wait(GIVES_WAY_S):
                 return
             with suppress(NoFreshFrame):
@@ -305,7 +305,7 @@ class RoverModel:
         self._closing.set()
         self._head.close()
         for camera in self.cameras.values():
-            camera.close()
+            camera.end()
         with self._render_lock:
             self._closed = True
             self._renderer.close()
@@ -322,9 +322,7 @@ class RoverModel:
         settings, size_px = self.settings.camera, self.rig.cameras[name].model.size_px
         own = self.settings.clocks.get(name, ClockSettings())
         usual = (name, settings, size_px, expose, taken, clock, self.faults, start_s, own)
-        if settings.exposure.auto:
-            return SelfExposedCamera(partial(self._metered, name), *usual)
-        return SimulatedCamera(*usual)
+        return SimulatedCamera(*usual, self.sensor_modes[name], partial(self._metered, name))
 
     def _exposed(self, name: str, begin_s: float, exposure_s: float) -> NDArray[np.float32]:
         """The light of one exposure on the sensor.

@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field, model_validator
 
 from calib.geometry.rigid import Rigid, rot_x, rot_y, rot_z
-from drivers.errors import BadOptions
+from drivers.options import DriverOptions
 from drivers.sim import ground, rocks
 from drivers.sim.compiled import kernels
 from drivers.sim.placed import (
@@ -28,6 +28,7 @@ from drivers.sim.placed import (
     check_apart,
     middle_m,
     named,
+    placed_or,
     radius_m,
 )
 from drivers.sim.rocks import Brick
@@ -40,53 +41,33 @@ OUTER_CELLS = 512
 OUTER_CELL_M = 4.0
 LEVEL_WITHIN_M = 0.8  # round the rover the relief is nearly flat...
 ROUGH_BEYOND_M = 2.5  # ...and whole from here on
-SCENE_BOUNDS = {
-    "seed": (0, 2**63),
-    "relief_m": (0, 1),
-    "rocks": (0, 500),
-    "bricks": (0, 24),
-    "sun_elevation_rad": (0.2, 1.5),
-}
 HILLS_FROM_M = 70.0
 HILL_M = 9.0
 SHADOW_SAMPLES = 4  # across a ground texel
 
 
-@dataclass(frozen=True)
-class SceneSettings:
-    """What a scene is made of.
+class SceneSettings(DriverOptions):
+    """What a scene is made of."""
 
-    Attributes
-    ----------
-    relief_m
-        How far the ground rises and falls about z = 0, metres, 0 to 1; 0 gives flat textured ground.
-    rocks
-        How many stones of 0.05-0.6 m lie 1.5-20 m away within 1.5 rad of north, 0 to 500; or just these.
-    bricks
-        How many bricks stand ahead, by turns 1.8 m and 6 m away, as far as there is room, 0 to 24; or just
-        these.
-    boards
-        Boards that stand there. Where one does, or a brick or rock was placed, no scattered one is.
-    sun_azimuth_rad, sun_elevation_rad
-        Where the sun stands: from north over east, and above the horizon (0.2 to 1.5 rad).
-    """
+    seed: Annotated[int, Field(ge=0, le=2**63)] = 1
+    """Of everything that is scattered."""
+    relief_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.15
+    """How far the ground rises and falls about z = 0, metres; 0 gives flat textured ground."""
+    rocks: Annotated[int | tuple[PlacedRock, ...], placed_or("rocks", 500)] = 50
+    """How many stones of 0.05-0.6 m lie 1.5-20 m away within 1.5 rad of north; or just these."""
+    bricks: Annotated[int | tuple[PlacedBrick, ...], placed_or("bricks", 24)] = 0
+    """How many bricks stand ahead, by turns 1.8 m and 6 m away, as far as there is space; or just these."""
+    boards: Annotated[tuple[PlacedBoard, ...], placed_or("boards")] = ()
+    """Boards that stand there. Where one does, or a brick or rock was placed, no scattered one is."""
+    sun_azimuth_rad: Annotated[float, Field(ge=-1e3, le=1e3)] = -1.95
+    """Where the sun stands, from north over east."""
+    sun_elevation_rad: Annotated[float, Field(ge=0.2, le=1.5)] = 0.70
+    """Where the sun stands, above the horizon."""
 
-    seed: int = 1
-    relief_m: float = 0.15
-    rocks: int | tuple[PlacedRock, ...] = 50
-    bricks: int | tuple[PlacedBrick, ...] = 0
-    boards: tuple[PlacedBoard, ...] = ()
-    sun_azimuth_rad: float = -1.95
-    sun_elevation_rad: float = 0.70
-
-    def __post_init__(self) -> None:
-        for name, (low, high) in SCENE_BOUNDS.items():
-            value = getattr(self, name)
-            if not isinstance(value, tuple) and not low <= value <= high:
-                raise BadOptions(f"scene: {name} {value} is not between {low} and {high}")
-        if not math.isfinite(self.sun_azimuth_rad):
-            raise BadOptions(f"scene: sun_azimuth_rad {self.sun_azimuth_rad} is not a number of radians")
+    @model_validator(mode="after")
+    def _check(self) -> Self:
         check_apart(self.placed)
+        return self
 
     @property
     def placed(self) -> dict[str, Placed]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -11,29 +10,21 @@ from pydantic import ConfigDict, Field, model_validator
 
 from calib.files.records import ABSENT, PathInFile
 from calib.geometry.mode import FLIPS, FlipName, Mode
+from drivers.errors import BadOptions
 from drivers.faults import read_script
-from drivers.options import DriverOptions, ReadBy, filled, read_options, wholes
+from drivers.options import DriverOptions, ReadBy, read_options, wholes
 from drivers.sim.camera_settings import CameraSettings, ClockSettings, TemperatureSettings
 from drivers.sim.heads import HeadModel, head_settings
 from drivers.sim.pan_tilt import DEFAULT_HEADS, check_head
-from drivers.sim.placed import read_list
 from drivers.sim.scene import SceneSettings
 from drivers.simulation_clock import simulation_speed
 
 
 def scene_settings(section: Any) -> SceneSettings:
     """Return the settings of ``simulation.scene``. Raises BadOptions."""
-    plain: Any = section
-    placed: dict[str, Any] = {}
-    if isinstance(section, Mapping):
-        placed = {
-            kind: read_list(kind, section[kind])
-            for kind in ("rocks", "bricks", "boards")
-            if isinstance(section.get(kind), list | tuple)
-        }
-        plain = {key: value for key, value in section.items() if key not in placed}
-    settings: SceneSettings = filled(SceneSettings(), plain, "simulation.scene")
-    return replace(settings, **placed)
+    if not isinstance(section, Mapping):
+        raise BadOptions(f"simulation.scene is {section!r}, expected keys and values")
+    return read_options(SceneSettings, section, place="simulation.scene")
 
 
 class ModeOptions(DriverOptions):

@@ -7,7 +7,8 @@ capture needs, in one plane or several. Layouts are those of 64-bit Linux (x86-6
 from __future__ import annotations
 
 import ctypes
-from ctypes import Structure, Union, c_char, c_int32, c_int64, c_uint8, c_uint16, c_uint32, c_uint64, c_void_p
+from ctypes import Structure, Union
+from typing import Any
 
 BUF_TYPE_VIDEO_CAPTURE = 1
 BUF_TYPE_VIDEO_CAPTURE_MPLANE = 9
@@ -68,297 +69,86 @@ CID_WHITE_BALANCE_TEMPERATURE = 0x0098091A
 EXPOSURE_MANUAL = 1
 
 
-class Capability(Structure):
-    """struct v4l2_capability."""
-
-    _fields_ = (
-        ("driver", c_char * 16),
-        ("card", c_char * 32),
-        ("bus_info", c_char * 32),
-        ("version", c_uint32),
-        ("capabilities", c_uint32),
-        ("device_caps", c_uint32),
-        ("reserved", c_uint32 * 3),
-    )
-
-
-class FmtDesc(Structure):
-    """struct v4l2_fmtdesc."""
-
-    _fields_ = (
-        ("index", c_uint32),
-        ("type", c_uint32),
-        ("flags", c_uint32),
-        ("description", c_char * 32),
-        ("pixelformat", c_uint32),
-        ("mbus_code", c_uint32),
-        ("reserved", c_uint32 * 3),
-    )
-
-
-class Fract(Structure):
-    """struct v4l2_fract."""
-
-    _fields_ = (("numerator", c_uint32), ("denominator", c_uint32))
-
-
-class FrmSizeEnum(Structure):
-    """struct v4l2_frmsizeenum; ``sizes`` holds width, height, or min, max, step of both."""
-
-    _fields_ = (
-        ("index", c_uint32),
-        ("pixel_format", c_uint32),
-        ("type", c_uint32),
-        ("sizes", c_uint32 * 6),
-        ("reserved", c_uint32 * 2),
-    )
-
-
-class FrmIvalEnum(Structure):
-    """struct v4l2_frmivalenum; ``intervals`` holds one interval, or min, max and step."""
-
-    _fields_ = (
-        ("index", c_uint32),
-        ("pixel_format", c_uint32),
-        ("width", c_uint32),
-        ("height", c_uint32),
-        ("type", c_uint32),
-        ("intervals", Fract * 3),
-        ("reserved", c_uint32 * 2),
-    )
-
-
-class PixFormat(Structure):
-    """struct v4l2_pix_format."""
-
-    _fields_ = (
-        ("width", c_uint32),
-        ("height", c_uint32),
-        ("pixelformat", c_uint32),
-        ("field", c_uint32),
-        ("bytesperline", c_uint32),
-        ("sizeimage", c_uint32),
-        ("colorspace", c_uint32),
-        ("priv", c_uint32),
-        ("flags", c_uint32),
-        ("ycbcr_enc", c_uint32),
-        ("quantization", c_uint32),
-        ("xfer_func", c_uint32),
-    )
-
-
-class PlanePixFormat(Structure):
-    """struct v4l2_plane_pix_format, which is packed."""
-
-    _pack_ = 1
-    _fields_ = (("sizeimage", c_uint32), ("bytesperline", c_uint32), ("reserved", c_uint16 * 6))
-
-
-class PixFormatMplane(Structure):
-    """struct v4l2_pix_format_mplane, which is packed."""
-
-    _pack_ = 1
-    _fields_ = (
-        ("width", c_uint32),
-        ("height", c_uint32),
-        ("pixelformat", c_uint32),
-        ("field", c_uint32),
-        ("colorspace", c_uint32),
-        ("plane_fmt", PlanePixFormat * MAX_PLANES),
-        ("num_planes", c_uint8),
-        ("flags", c_uint8),
-        ("ycbcr_enc", c_uint8),
-        ("quantization", c_uint8),
-        ("xfer_func", c_uint8),
-        ("reserved", c_uint8 * 7),
-    )
-
-
-class _FormatUnion(Union):
-    # v4l2_window holds pointers, which align the union to 8.
-    _fields_ = (("pix", PixFormat), ("pix_mp", PixFormatMplane), ("raw", c_uint8 * 200), ("align", c_uint64))
-
-
-class Format(Structure):
-    """struct v4l2_format."""
-
-    _fields_ = (("type", c_uint32), ("fmt", _FormatUnion))
-
-
-class CaptureParm(Structure):
-    """struct v4l2_captureparm."""
-
-    _fields_ = (
-        ("capability", c_uint32),
-        ("capturemode", c_uint32),
-        ("timeperframe", Fract),
-        ("extendedmode", c_uint32),
-        ("readbuffers", c_uint32),
-        ("reserved", c_uint32 * 4),
-    )
-
-
-class _ParmUnion(Union):
-    _fields_ = (("capture", CaptureParm), ("raw", c_uint8 * 200))
-
-
-class StreamParm(Structure):
-    """struct v4l2_streamparm."""
-
-    _fields_ = (("type", c_uint32), ("parm", _ParmUnion))
-
-
-class RequestBuffers(Structure):
-    """struct v4l2_requestbuffers."""
-
-    _fields_ = (
-        ("count", c_uint32),
-        ("type", c_uint32),
-        ("memory", c_uint32),
-        ("capabilities", c_uint32),
-        ("flags", c_uint8),
-        ("reserved", c_uint8 * 3),
-    )
-
-
-class Rect(Structure):
-    """struct v4l2_rect."""
-
-    _fields_ = (("left", c_int32), ("top", c_int32), ("width", c_uint32), ("height", c_uint32))
-
-
-class Selection(Structure):
-    """struct v4l2_selection."""
-
-    _fields_ = (
-        ("type", c_uint32),
-        ("target", c_uint32),
-        ("flags", c_uint32),
-        ("r", Rect),
-        ("reserved", c_uint32 * 9),
-    )
-
-
-class Timeval(Structure):
-    """struct timeval."""
-
-    _fields_ = (("tv_sec", c_int64), ("tv_usec", c_int64))
-
-
-class Timecode(Structure):
-    """struct v4l2_timecode."""
-
-    _fields_ = (
-        ("type", c_uint32),
-        ("flags", c_uint32),
-        ("frames", c_uint8),
-        ("seconds", c_uint8),
-        ("minutes", c_uint8),
-        ("hours", c_uint8),
-        ("userbits", c_uint8 * 4),
-    )
-
-
-class _BufferMemory(Union):
-    _fields_ = (("offset", c_uint32), ("userptr", c_uint64), ("planes", c_void_p), ("fd", c_int32))
-
-
-class _PlaneMemory(Union):
-    _fields_ = (("mem_offset", c_uint32), ("userptr", c_uint64), ("fd", c_int32))
-
-
-class BufferPlane(Structure):
-    """struct v4l2_plane."""
-
-    _fields_ = (
-        ("bytesused", c_uint32),
-        ("length", c_uint32),
-        ("m", _PlaneMemory),
-        ("data_offset", c_uint32),
-        ("reserved", c_uint32 * 11),
-    )
-
-
-class Buffer(Structure):
-    """struct v4l2_buffer."""
-
-    _fields_ = (
-        ("index", c_uint32),
-        ("type", c_uint32),
-        ("bytesused", c_uint32),
-        ("flags", c_uint32),
-        ("field", c_uint32),
-        ("timestamp", Timeval),
-        ("timecode", Timecode),
-        ("sequence", c_uint32),
-        ("memory", c_uint32),
-        ("m", _BufferMemory),
-        ("length", c_uint32),
-        ("reserved2", c_uint32),
-        ("request_fd", c_int32),
-    )
-
-
-class QueryExtCtrl(Structure):
-    """struct v4l2_query_ext_ctrl."""
-
-    _fields_ = (
-        ("id", c_uint32),
-        ("type", c_uint32),
-        ("name", c_char * 32),
-        ("minimum", c_int64),
-        ("maximum", c_int64),
-        ("step", c_uint64),
-        ("default_value", c_int64),
-        ("flags", c_uint32),
-        ("elem_size", c_uint32),
-        ("elems", c_uint32),
-        ("nr_of_dims", c_uint32),
-        ("dims", c_uint32 * 4),
-        ("reserved", c_uint32 * 32),
-    )
-
-
-class _ExtControlValue(Union):
-    _pack_ = 1
-    _fields_ = (("value", c_int32), ("value64", c_int64), ("pointer", c_void_p))
-
-
-class ExtControl(Structure):
-    """struct v4l2_ext_control, which is packed."""
-
-    _pack_ = 1
-    _fields_ = (
-        ("id", c_uint32),
-        ("size", c_uint32),
-        ("reserved2", c_uint32),
-        ("u", _ExtControlValue),
-    )
-
-
-class ExtControls(Structure):
-    """struct v4l2_ext_controls."""
-
-    _fields_ = (
-        ("which", c_uint32),
-        ("count", c_uint32),
-        ("error_idx", c_uint32),
-        ("request_fd", c_int32),
-        ("reserved", c_uint32),
-        ("controls", ctypes.POINTER(ExtControl)),
-    )
-
-
-class _MenuEntry(Union):
-    _pack_ = 1
-    _fields_ = (("name", c_char * 32), ("value", c_int64))
-
-
-class QueryMenu(Structure):
-    """struct v4l2_querymenu, which is packed."""
-
-    _pack_ = 1
-    _fields_ = (("id", c_uint32), ("index", c_uint32), ("u", _MenuEntry), ("reserved", c_uint32))
+_TYPES: dict[str, Any] = {
+    "u8": ctypes.c_uint8, "u16": ctypes.c_uint16, "u32": ctypes.c_uint32, "u64": ctypes.c_uint64,
+    "s32": ctypes.c_int32, "s64": ctypes.c_int64, "char": ctypes.c_char, "void*": ctypes.c_void_p,
+}  # fmt: skip
+
+
+def _laid_out(name: str, declarations: str, base: type = Structure, packed: bool = False) -> type[Structure]:
+    """Return a structure or union of C's declarations, such as ``u32 index; char name[32]``."""
+    fields = []
+    for declaration in declarations.split(";"):
+        kind, _, names = declaration.strip().partition(" ")
+        for one in names.split(","):
+            field, _, count = one.strip().removesuffix("]").partition("[")
+            fields.append((field, _TYPES[kind] * int(count) if count else _TYPES[kind]))
+    members = {"_fields_": fields, "__doc__": f"struct v4l2_{name}.", **({"_pack_": 1} if packed else {})}
+    made: type[Structure] = type(name, (base,), members)
+    _TYPES[name] = made
+    return made
+
+
+Capability = _laid_out(
+    "capability",
+    "char driver[16], card[32], bus_info[32]; u32 version, capabilities, device_caps, reserved[3]",
+)
+FmtDesc = _laid_out(
+    "fmtdesc", "u32 index, type, flags; char description[32]; u32 pixelformat, mbus_code, reserved[3]"
+)
+Fract = _laid_out("fract", "u32 numerator, denominator")
+# ``sizes``: width and height, or min, max, step of both; ``intervals``: one, or min, max and step
+FrmSizeEnum = _laid_out("frmsizeenum", "u32 index, pixel_format, type, sizes[6], reserved[2]")
+FrmIvalEnum = _laid_out(
+    "frmivalenum", "u32 index, pixel_format, width, height, type; fract intervals[3]; u32 reserved[2]"
+)
+PixFormat = _laid_out(
+    "pix_format",
+    "u32 width, height, pixelformat, field, bytesperline, sizeimage, colorspace, priv, flags, ycbcr_enc,"
+    "quantization, xfer_func",
+)
+PlanePixFormat = _laid_out("plane_pix_format", "u32 sizeimage, bytesperline; u16 reserved[6]", packed=True)
+PixFormatMplane = _laid_out(
+    "pix_format_mplane",
+    f"u32 width, height, pixelformat, field, colorspace; plane_pix_format plane_fmt[{MAX_PLANES}];"
+    "u8 num_planes, flags, ycbcr_enc, quantization, xfer_func, reserved[7]",
+    packed=True,
+)
+# v4l2_window holds pointers, which align the union to 8
+_laid_out("format_fmt", "pix_format pix; pix_format_mplane pix_mp; u8 raw[200]; u64 align", Union)
+Format = _laid_out("format", "u32 type; format_fmt fmt")
+CaptureParm = _laid_out(
+    "captureparm",
+    "u32 capability, capturemode; fract timeperframe; u32 extendedmode, readbuffers, reserved[4]",
+)
+_laid_out("streamparm_parm", "captureparm capture; u8 raw[200]", Union)
+StreamParm = _laid_out("streamparm", "u32 type; streamparm_parm parm")
+RequestBuffers = _laid_out("requestbuffers", "u32 count, type, memory, capabilities; u8 flags, reserved[3]")
+Rect = _laid_out("rect", "s32 left, top; u32 width, height")
+Selection = _laid_out("selection", "u32 type, target, flags; rect r; u32 reserved[9]")
+_laid_out("timeval", "s64 tv_sec, tv_usec")
+Timecode = _laid_out("timecode", "u32 type, flags; u8 frames, seconds, minutes, hours, userbits[4]")
+_laid_out("plane_m", "u32 mem_offset; u64 userptr; s32 fd", Union)
+BufferPlane = _laid_out("plane", "u32 bytesused, length; plane_m m; u32 data_offset, reserved[11]")
+_laid_out("buffer_m", "u32 offset; u64 userptr; void* planes; s32 fd", Union)
+Buffer = _laid_out(
+    "buffer",
+    "u32 index, type, bytesused, flags, field; timeval timestamp; timecode timecode; u32 sequence, memory;"
+    "buffer_m m; u32 length, reserved2; s32 request_fd",
+)
+QueryExtCtrl = _laid_out(
+    "query_ext_ctrl",
+    "u32 id, type; char name[32]; s64 minimum, maximum; u64 step; s64 default_value;"
+    "u32 flags, elem_size, elems, nr_of_dims, dims[4], reserved[32]",
+)
+_laid_out("ext_control_value", "s32 value; s64 value64; void* pointer", Union, packed=True)
+ExtControl = _laid_out("ext_control", "u32 id, size, reserved2; ext_control_value u", packed=True)
+_TYPES["ext_control*"] = ctypes.POINTER(ExtControl)
+ExtControls = _laid_out(
+    "ext_controls", "u32 which, count, error_idx; s32 request_fd; u32 reserved; ext_control* controls"
+)
+_laid_out("querymenu_name", "char name[32]; s64 value", Union, packed=True)
+QueryMenu = _laid_out("querymenu", "u32 id, index; querymenu_name u; u32 reserved", packed=True)
 
 
 _WRITE, _READ = 1, 2
@@ -381,8 +171,8 @@ VIDIOC_REQBUFS = _both(8, RequestBuffers)
 VIDIOC_QUERYBUF = _both(9, Buffer)
 VIDIOC_QBUF = _both(15, Buffer)
 VIDIOC_DQBUF = _both(17, Buffer)
-VIDIOC_STREAMON = _request(_WRITE, 18, ctypes.sizeof(c_int32))
-VIDIOC_STREAMOFF = _request(_WRITE, 19, ctypes.sizeof(c_int32))
+VIDIOC_STREAMON = _request(_WRITE, 18, ctypes.sizeof(ctypes.c_int32))
+VIDIOC_STREAMOFF = _request(_WRITE, 19, ctypes.sizeof(ctypes.c_int32))
 VIDIOC_G_PARM = _both(21, StreamParm)
 VIDIOC_S_PARM = _both(22, StreamParm)
 VIDIOC_QUERYMENU = _both(37, QueryMenu)

@@ -16,15 +16,6 @@ from drivers.v4l2.node import Node, reason
 Value = int | str | bool
 
 _MOST_CONTROLS = 1024
-_PLAIN = (
-    abi.CTRL_TYPE_INTEGER,
-    abi.CTRL_TYPE_BOOLEAN,
-    abi.CTRL_TYPE_MENU,
-    abi.CTRL_TYPE_INTEGER64,
-    abi.CTRL_TYPE_BITMASK,
-    abi.CTRL_TYPE_INTEGER_MENU,
-    abi.CTRL_TYPE_BUTTON,
-)
 _TYPE_WORDS = {
     abi.CTRL_TYPE_INTEGER: "integer",
     abi.CTRL_TYPE_BOOLEAN: "boolean",
@@ -35,6 +26,7 @@ _TYPE_WORDS = {
     abi.CTRL_TYPE_BITMASK: "bitmask",
     abi.CTRL_TYPE_INTEGER_MENU: "menu",
 }
+_SETTABLE = _TYPE_WORDS.keys() - {abi.CTRL_TYPE_STRING}
 
 _REASONS = {
     errno.EACCES: "it cannot be changed now; its automatic may be on",
@@ -56,8 +48,6 @@ class CameraControl:
     kind
         ``integer``, ``integer64``, ``boolean``, ``menu``, ``bitmask``, ``button``, ``string``, or
         ``type 263`` for one that this program does not know; the last two can be listed but not set.
-    minimum, maximum, step, default
-        Its range, in the device's own units.
     settable
         Whether it takes a value (perhaps not now: an inactive one waits for its automatic to be off).
     """
@@ -75,7 +65,7 @@ class CameraControl:
 
 @dataclass(frozen=True)
 class ControlProblem:
-    """A control that is not as it was asked for, in one plain sentence.
+    """A control that is not as it was requested, in one plain sentence.
 
     ``became``: what it is instead; None if the camera did not take it.
     """
@@ -116,7 +106,7 @@ def get_value(node: Node, control: CameraControl) -> int | None:
 
 
 def set_value(node: Node, control: CameraControl, value: Value) -> ControlProblem | None:
-    """Set a control and read it back; return what did not go as asked."""
+    """Set a control and read it back; return what did not go as requested."""
     number = _number(control, value)
     if isinstance(number, str):
         return ControlProblem(control.name, number)
@@ -133,8 +123,8 @@ def set_value(node: Node, control: CameraControl, value: Value) -> ControlProble
         return ControlProblem(control.name, f"{control.name} does not take {value!r}: {refused}")
     became = get_value(node, control)
     if became is not None and became != number:
-        words = f"{control.name} is {became} where {number} was set{_range(control)}"
-        return ControlProblem(control.name, words, became)
+        message = f"{control.name} is {became} where {number} was set{_range(control)}"
+        return ControlProblem(control.name, message, became)
     return None
 
 
@@ -164,12 +154,12 @@ def plain_name(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
 
 
-def _control(node: Node, query: abi.QueryExtCtrl) -> CameraControl:
+def _control(node: Node, query: ctypes.Structure) -> CameraControl:
     kind = _TYPE_WORDS.get(query.type, f"type {query.type}")
     if query.flags & abi.CTRL_FLAG_HAS_PAYLOAD and kind != "string":
         kind = f"type {query.type}"
     menu = _menu(node, query) if query.type in (abi.CTRL_TYPE_MENU, abi.CTRL_TYPE_INTEGER_MENU) else {}
-    settable = query.type in _PLAIN and not query.flags & (
+    settable = query.type in _SETTABLE and not query.flags & (
         abi.CTRL_FLAG_READ_ONLY | abi.CTRL_FLAG_HAS_PAYLOAD
     )
     name = plain_name(query.name.decode(errors="replace"))
@@ -177,7 +167,7 @@ def _control(node: Node, query: abi.QueryExtCtrl) -> CameraControl:
     return CameraControl(query.id, name, kind, *bounds, settable, menu)
 
 
-def _menu(node: Node, query: abi.QueryExtCtrl) -> dict[int, str]:
+def _menu(node: Node, query: ctypes.Structure) -> dict[int, str]:
     """A menu's entries; numbers may be left out by the driver."""
     entries = {}
     for index in range(max(0, query.minimum), min(query.maximum, query.minimum + _MOST_CONTROLS) + 1):
@@ -209,7 +199,7 @@ def _range(control: CameraControl) -> str:
     return f" ({control.minimum} to {control.maximum}, step {control.step})"
 
 
-def _exchange(node: Node, request: int, entry: abi.ExtControl) -> str:
+def _exchange(node: Node, request: int, entry: ctypes.Structure) -> str:
     """Make a request about one control; empty if it went well, else why not."""
     whole = abi.ExtControls(which=abi.CTRL_WHICH_CUR_VAL, count=1, controls=ctypes.pointer(entry))
     try:

@@ -47,13 +47,7 @@ def level(image: Image, percentile: float) -> float:
 
 
 class ExposureControl:
-    """Finds the exposure time for a group of cameras; safe from any thread.
-
-    Parameters
-    ----------
-    exposure_s
-        The exposure time to begin with, seconds.
-    """
+    """Finds the exposure time for a group of cameras; safe from any thread."""
 
     def __init__(self, settings: AutoExposureSettings, exposure_s: float) -> None:
         self._settings = settings

@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from drivers.errors import BadOptions, DriverError, NoCamera, NoPermission, UnsupportedFormat
 from drivers.pixels import FORMATS
@@ -23,29 +23,16 @@ SYSFS = Path("/sys/class/video4linux")
 _NUMBERED = re.compile(r"/dev/video\d+")
 
 
-@dataclass(frozen=True)
-class Address:
-    """How a configuration names a camera: by a link, or by card name and bus (one of them, or both).
+class Address(NamedTuple):
+    """How a configuration names a camera: by a link that udev keeps, or by card, bus, or both."""
 
-    Attributes
-    ----------
-    link
-        A path under /dev/v4l/by-id or by-path, or another link that udev keeps.
-    card
-        The name that the driver gives, as `mastctl camera list` shows it.
-    bus
-        Where it is plugged in, as `mastctl camera list` shows it.
-    """
-
-    link: Path | None = None
+    device: str = ""
     card: str = ""
     bus: str = ""
 
     def __str__(self) -> str:
-        if self.link is not None:
-            return str(self.link)
         card = f"card {self.card!r}" if self.card else "any card"
-        return f"{card} at {self.bus}" if self.bus else card
+        return self.device or (f"{card} at {self.bus}" if self.bus else card)
 
 
 @dataclass(frozen=True)
@@ -61,13 +48,13 @@ class FoundCamera:
 
 def check_address(address: Address, name: str) -> None:
     """Refuse a bare node number, and name what is stable instead. Raises BadOptions."""
-    if address.link is None and not address.card and not address.bus:
+    if not any(address):
         raise BadOptions("'device', 'card' or 'bus' is expected: which camera it is", device=name)
-    if address.link is not None and _NUMBERED.fullmatch(str(address.link)):
-        links = stable_links(address.link)
+    if _NUMBERED.fullmatch(address.device):
+        links = stable_links(Path(address.device))
         instead = f"give {links[0]}" if links else "give a link under /dev/v4l/by-id, or 'card' and 'bus'"
         raise BadOptions(
-            f"{address.link} is a number that changes when cameras are plugged in; {instead} "
+            f"{address.device} is a number that changes when cameras are plugged in; {instead} "
             "(mastctl camera list shows them)",
             device=name,
         )
@@ -78,8 +65,8 @@ def open_node(address: Address, name: str) -> Node:
 
     Raises NoCamera if nothing of that name is connected; BadOptions if several cameras bear it; DriverError.
     """
-    if address.link is not None:
-        return Node(address.link, name)
+    if address.device:
+        return Node(address.device, name)
     matches = list(_named(address, name))
     if len(matches) == 1:
         return matches[0]
@@ -97,10 +84,12 @@ def list_cameras() -> list[FoundCamera]:
     for path in capture_nodes():
         try:
             with Node(path) as node:
-                who = node.identity
+                identity = node.identity
         except DriverError:
             continue  # an output, a metadata node, or one of somebody else's
-        found.append(FoundCamera(path, who.driver, who.card, who.bus, tuple(stable_links(path))))
+        found.append(
+            FoundCamera(path, identity.driver, identity.card, identity.bus, tuple(stable_links(path)))
+        )
     return found
 
 
@@ -138,8 +127,8 @@ def _named(address: Address, name: str) -> Iterable[Node]:
             continue
         except DriverError:
             continue
-        who = node.identity
-        if address.card in ("", who.card, label) and address.bus in ("", who.bus):
+        identity = node.identity
+        if address.card in ("", identity.card, label) and address.bus in ("", identity.bus):
             any_match = True
             yield node
         else:
@@ -157,7 +146,7 @@ def _sysfs_name(path: Path) -> str:
 
 
 def _connected() -> str:
-    """The connected cameras in words."""
+    """The connected cameras, as text."""
     return ", ".join(f"{c.card!r} at {c.bus}" for c in list_cameras()) or "none"
 
 
@@ -185,21 +174,19 @@ def options_for(
                 raise UnsupportedFormat(
                     f"the camera has only formats that are not read: {', '.join(offered)}", device=word
                 )
-        who = node.identity
+        identity = node.identity
         address = (
             {"device": word}
             if path == Path(word) and path.is_symlink()
-            else {"bus": who.bus, "card": who.card}
+            else {"bus": identity.bus, "card": identity.card}
         )
-    size_px = now.size_px if size_px is None else size_px
-    options: dict[str, Any] = {
+    return {
         **address,
         "format": code,
-        "size_px": list(size_px),
+        "size_px": list(size_px or now.size_px),
         "controls": dict(controls),
+        "rate_hz": rate_hz,
     }
-    options["rate_hz"] = rate_hz
-    return options
 
 
 def _node_path(word: str) -> Path:
@@ -209,11 +196,10 @@ def _node_path(word: str) -> Path:
     matches = [c for c in list_cameras() if word in (c.card, c.bus)]
     if len(matches) == 1:
         return matches[0].node
-    connected = ", ".join(f"{c.card!r} at {c.bus}" for c in list_cameras()) or "none"
     if matches:
         busses = ", ".join(c.bus for c in matches)
         raise DriverError(f"several cameras have this name; give a bus instead: {busses}", device=word)
-    raise NoCamera(f"no camera of this card or bus is connected; connected are {connected}", device=word)
+    raise NoCamera(f"no camera of this card or bus is connected; connected are {_connected()}", device=word)
 
 
 LEAST_PX, USUAL_HZ = (640, 480), 30.0

@@ -1,4 +1,4 @@
-"""One open video node: the kernel's requests as methods, and its refusals as typed errors in plain words."""
+"""One open video node: the kernel's requests as methods, and its refusals as typed errors."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ class Node:
         """Return a rectangle of its cropping: left, top, width, height; None if it reports none."""
         # The kernel takes the single-planar type for nodes of either kind.
         entry = abi.Selection(type=abi.BUF_TYPE_VIDEO_CAPTURE, target=target)
-        if not self._next(abi.VIDIOC_G_SELECTION, entry, "tell its crop"):
+        if not self._next(abi.VIDIOC_G_SELECTION, entry, "report its crop"):
             return None
         return entry.r.left, entry.r.top, entry.r.width, entry.r.height
 
@@ -186,7 +186,7 @@ class Node:
     def current_format(self) -> PictureFormat:
         """Return the format that is set now. Raises DriverError."""
         found = abi.Format(type=self._type)
-        self.call(abi.VIDIOC_G_FMT, found, "tell its format")
+        self.call(abi.VIDIOC_G_FMT, found, "report its format")
         return _picture_format(found)
 
     def set_rate(self, rate_hz: float) -> float | None:
@@ -202,7 +202,7 @@ class Node:
         return _rate(parm)
 
     def current_rate(self) -> float | None:
-        """Return the frame rate that is set now, None where the driver does not tell."""
+        """Return the frame rate that is set now, None where the driver does not say."""
         parm = abi.StreamParm(type=self._type)
         return _rate(parm) if self._next(abi.VIDIOC_G_PARM, parm) else None
 
@@ -290,7 +290,7 @@ class Node:
         except OSError as error:
             raise self.failure(error, what) from None
 
-    def _buffer(self, index: int) -> abi.Buffer:
+    def _buffer(self, index: int) -> ctypes.Structure:
         buffer = abi.Buffer(index=index, type=self._type, memory=abi.MEMORY_MMAP)
         if self._in_planes:
             buffer.m.planes, buffer.length = ctypes.addressof(self._planes), abi.MAX_PLANES
@@ -347,7 +347,7 @@ class Node:
 
 
 def reason(error: OSError) -> str:
-    """Return why the kernel refused a request, in words."""
+    """Return why the kernel refused a request."""
     return _USB_REASONS.get(error.errno or 0) or os.strerror(error.errno or 0)
 
 
@@ -402,7 +402,7 @@ def _what_else(flags: int) -> str:
     return "is no camera: it captures no video"
 
 
-def _picture_format(answer: abi.Format) -> PictureFormat:
+def _picture_format(answer: ctypes.Structure) -> PictureFormat:
     if answer.type == abi.BUF_TYPE_VIDEO_CAPTURE_MPLANE:
         several = answer.fmt.pix_mp
         lengths = tuple(plane.sizeimage for plane in several.plane_fmt[: several.num_planes])
@@ -414,7 +414,7 @@ def _picture_format(answer: abi.Format) -> PictureFormat:
     return PictureFormat(code, (pix.width, pix.height), pix.bytesperline, pix.sizeimage, pix.field)
 
 
-def _rate(parm: abi.StreamParm) -> float | None:
+def _rate(parm: ctypes.Structure) -> float | None:
     """The frame rate in an answer, if it holds one."""
     period = parm.parm.capture.timeperframe
     if not parm.parm.capture.capability & abi.CAPTURE_TIMEPERFRAME or not period.numerator:

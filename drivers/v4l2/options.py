@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
@@ -73,7 +72,7 @@ class CameraOptions(DriverOptions):
     @property
     def address(self) -> Address:
         """Which camera it is."""
-        return Address(Path(self.device) if self.device else None, self.card, self.bus)
+        return Address(self.device, self.card, self.bus)
 
     @model_validator(mode="after")
     def _check(self) -> CameraOptions:
@@ -90,8 +89,8 @@ class CameraOptions(DriverOptions):
             object.__setattr__(self, "auto_exposure", auto)
         check_in_frame("auto_exposure.longest_s", auto.longest_s, self.rate_hz)
         if auto.shortest_s >= auto.longest_s:
-            words = f"{auto.shortest_s:g} s, expected less than longest_s ({auto.longest_s:g} s)"
-            raise problem("auto_exposure.shortest_s", words)
+            message = f"{auto.shortest_s:g} s, expected less than longest_s ({auto.longest_s:g} s)"
+            raise problem("auto_exposure.shortest_s", message)
         return self
 
 

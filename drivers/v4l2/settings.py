@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from drivers.clock import Clock
-from drivers.errors import BadSetting
+from drivers.errors import DriverError
 from drivers.interfaces import CameraSetting
 from drivers.v4l2 import abi
 from drivers.v4l2.controls import CameraControl, first_of, get_value, list_controls, set_value
 from drivers.v4l2.node import Node
 from drivers.v4l2.options import CameraOptions
-from drivers.values_set import ValuesSet
+from drivers.values_set import ValuesSet, change_each
 
 EXPOSURE_UNIT_S = 1e-4  # of V4L2_CID_EXPOSURE_ABSOLUTE
 
@@ -28,8 +28,6 @@ class ControlMeaning:
 
     Attributes
     ----------
-    name, word
-        As in `drivers.interfaces.SETTINGS`, and in words.
     automatic, off
         The control of its automatic, and that control's value for off.
     """
@@ -124,54 +122,31 @@ def change(
     in_force: Mapping[str, ValuesSet],
     clock: Clock,
     device: str,
-) -> tuple[dict[str, float], list[str], BadSetting | None]:
-    """Change settings one after the other, and note from which frame on each is in force.
-
-    Returns
-    -------
-    became
-        The new value of each that was changed, as the camera has it.
-    notes
-        A sentence for each that became another than asked for.
-    refused
-        The error of one that the camera did not take; those behind it were left alone.
-    """
+) -> tuple[dict[str, float], list[str], DriverError | None]:
+    """Change settings one after the other, as `change_each`."""
     controls = list_controls(node)
-    became: dict[str, float] = {}
-    notes: list[str] = []
-    for one in MEANINGS:
-        if one.name not in wanted:
-            continue
-        control = first_of(controls, (one.control,))
-        if control is None:
-            return became, notes, BadSetting(f"it has no control for {one.word}", device=device)
-        counts = min(max(one.counts(wanted[one.name]), control.minimum), control.maximum)
-        values = in_force[one.name]
-        values.begin(clock.now_s())
-        value = None
-        try:
-            problem, was, left = None, None, ""
-            if (automatic := first_of(controls, (one.automatic,))) is not None:
-                was = get_value(node, automatic)
-                problem = set_value(node, automatic, one.off)
-            problem = problem or set_value(node, control, counts)
-            refused = problem is not None and problem.became is None
-            # A refused value leaves the automatic as it was.
-            if refused and automatic and was is not None and set_value(node, automatic, was) is not None:
-                left = f"; {automatic.name} stays {one.off}"
-            value = value_of(node, controls, one)
-        finally:
-            values.end(value, clock.now_s())
-        if value is None or refused:
-            words = "its automatic stays on" if problem is None else problem.message
-            return became, notes, BadSetting(f"{one.name} was not changed: {words}{left}", device=device)
-        became[one.name] = value
-        if not math.isclose(value, wanted[one.name], rel_tol=1e-9, abs_tol=1e-12):
-            notes.append(
-                f"{device}: {one.name} is {value:.6g} where {wanted[one.name]:.6g} was asked for; "
-                f"the camera has steps of {control.step * one.unit:g}"
-            )
-    return became, notes, None
+    meanings = {one.name: one for one in MEANINGS if first_of(controls, (one.control,)) is not None}
+    known = {name: values for name, values in in_force.items() if name in meanings}
+
+    def set_one(name: str, value: float) -> tuple[float | None, str, str]:
+        one = meanings[name]
+        control, automatic = (first_of(controls, (number,)) for number in (one.control, one.automatic))
+        assert control is not None
+        problem, was, left = None, None, ""
+        if automatic is not None:
+            was = get_value(node, automatic)
+            problem = set_value(node, automatic, one.off)
+        counts = min(max(one.counts(value), control.minimum), control.maximum)
+        problem = problem or set_value(node, control, counts)
+        refused = problem is not None and problem.became is None
+        # A refused value leaves the automatic as it was.
+        if refused and automatic and was is not None and set_value(node, automatic, was) is not None:
+            left = f"; {automatic.name} stays {one.off}"
+        reason = f"{problem.message}{left}" if refused and problem is not None else ""
+        return value_of(node, controls, one), reason, f"; the camera has steps of {control.step * one.unit:g}"
+
+    ordered = [(one.name, wanted[one.name]) for one in MEANINGS if one.name in wanted]
+    return change_each(ordered, known, set_one, clock.now_s, device)
 
 
 def with_settings(options: CameraOptions, became: Mapping[str, float]) -> CameraOptions:

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from drivers.newest import ExposureWindow
 from drivers.pixels import PictureFormat
 from drivers.v4l2 import abi
 from drivers.v4l2.node import Dequeued
@@ -30,8 +31,6 @@ class StampRule:
     ----------
     margin_s
         The camera's configured margin: how much earlier than its stamp says an exposure may have begun.
-    driver
-        The kernel driver's name; those of `READOUT_STAMPERS` need a rule of their own.
     """
 
     margin_s: float
@@ -59,26 +58,6 @@ class Timing(NamedTuple):
     before_apart_s: float | None
 
 
-class StampWindow(NamedTuple):
-    """A stretch of time in which the whole exposure lay, seconds of CLOCK_MONOTONIC."""
-
-    begin_s: float
-    end_s: float
-
-    @property
-    def mid_s(self) -> float:
-        """The middle: the best guess of mid-exposure."""
-        return (self.begin_s + self.end_s) / 2
-
-    @property
-    def length_s(self) -> float:
-        return self.end_s - self.begin_s
-
-    def mid_uncertainty_s(self, exposure_s: float | None) -> float:
-        """The most that mid-exposure may be from the window's middle; less if the exposure is known."""
-        return max(0.0, self.length_s - (exposure_s or 0.0)) / 2
-
-
 class Arrived(NamedTuple):
     """A good frame, without its picture.
 
@@ -86,20 +65,14 @@ class Arrived(NamedTuple):
     ----------
     buffer, format
         The kernel's buffer with the driver's own count and stamp, and what its bytes mean.
-    timing, window
-        What is known of its exposure time, and in which the whole exposure lay.
     sequence, stream
         Our own count, which grows over every reopening, and the number of the stream.
-    received_s
-        When it was dequeued, seconds of CLOCK_MONOTONIC.
-    settings
-        Exposure, gain, ... of it, as `drivers.interfaces.Frame` has them.
     """
 
     buffer: Dequeued
     format: PictureFormat
     timing: Timing
-    window: StampWindow
+    window: ExposureWindow
     sequence: int
     stream: int
     received_s: float
@@ -108,7 +81,7 @@ class Arrived(NamedTuple):
 
 def exposure_window(
     rule: StampRule, timing: Timing, flags: int, stamp_s: float, received_s: float
-) -> StampWindow | None:
+) -> ExposureWindow | None:
     """Return the window of a frame's exposure, None if nothing says when that began at the earliest.
 
     No row is exposed before its last picture was read out, and one readout follows the other. So readout and
@@ -121,11 +94,6 @@ def exposure_window(
     - end-of-frame stamps: [t - T - e - m, t], with e = U where it is not known.
 
     No window ends after the frame was received, nor does a stamp count that is later than that.
-
-    Parameters
-    ----------
-    stamp_s, received_s
-        The buffer's stamp, and when it was dequeued, seconds of CLOCK_MONOTONIC.
     """
     stamp_s = min(stamp_s, received_s)
     apart_s, longest_s = timing.apart_s, timing.longest_s
@@ -147,7 +115,7 @@ def exposure_window(
         if apart_s is not None and longest_s is not None:
             ends_s = stamp_s + longest_s + apart_s
     begin_s -= rule.margin_s
-    return StampWindow(begin_s, max(begin_s, min(ends_s, received_s)))
+    return ExposureWindow(begin_s, max(begin_s, min(ends_s, received_s)))
 
 
 class Spacing:
@@ -174,7 +142,7 @@ class Spacing:
         before, stamped_s = self._last or (sequence, stamp_s)
         self._last = sequence, stamp_s
         between_s, lost = stamp_s - stamped_s, sequence - before - 1
-        if between_s <= 0.0:  # the first, or stamps that began again: nothing is told of what was before
+        if between_s <= 0.0:  # the first, or stamps that began again: nothing is known of what was before
             self._apart_s = None
             return None, None
         apart_s = between_s

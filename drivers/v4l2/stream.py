@@ -1,4 +1,4 @@
-"""One opened and streaming camera: what was asked, what the camera answered, and what it lacks."""
+"""One opened and streaming camera: what was requested, what the camera answered, and what it lacks."""
 
 from __future__ import annotations
 
@@ -41,17 +41,13 @@ class Stream:
     Attributes
     ----------
     rate_hz, period_s
-        The rate that the camera answered, or the asked one where it does not tell; from frame to frame.
-    rate_told
-        Whether the camera itself told that rate.
-    in_force
-        With which exposure time, gain, ... a frame may have been taken, of those that it has.
+        The rate that the camera answered, or the requested one where it does not say; from frame to frame.
+    rate_known
+        Whether the camera itself reports that rate.
     exposure_s
         The exposure time by the camera's own word, None if unknown: also where its automatic stayed on.
-    asked_exposure_s
+    requested_exposure_s
         The exposure time that was set last, before the camera rounded it.
-    sensor_mode
-        Which pixels of the sensor frames show, as far as the driver reports it.
     """
 
     def __init__(
@@ -61,7 +57,7 @@ class Stream:
         self._name = name
         self._clock = clock
         self.exposure_s: float | None = None
-        self.asked_exposure_s: float | None = None
+        self.requested_exposure_s: float | None = None
         self.problems: list[ControlProblem] = []
         self.in_force = {EXPOSURE.name: ValuesSet(None)}
         self._exposure: CameraControl | None = None
@@ -69,7 +65,7 @@ class Stream:
         self.node = find.open_node(options.address, name)
         try:
             self.format = set_format(self.node, options.format, options.size_px, name)
-            self.rate_hz, self.rate_told = _set_rate(self.node, options, name)
+            self.rate_hz, self.rate_known = _set_rate(self.node, options, name)
             self.period_s = 1 / self.rate_hz
             self.rule = StampRule(options.margin_s, self.node.identity.driver)
             exposure_s = options.exposure_s if exposure_s is None else exposure_s
@@ -86,7 +82,7 @@ class Stream:
 
     def set_exposure(self, exposure_s: float) -> None:
         """Set the exposure time; `exposure_s` is then what the camera made of it. Raises DriverError."""
-        self.asked_exposure_s = exposure_s
+        self.requested_exposure_s = exposure_s
         if self._exposure is None:
             return
         steps = max(1, round(exposure_s / EXPOSURE_UNIT_S))
@@ -99,11 +95,11 @@ class Stream:
         self.exposure_s = became * EXPOSURE_UNIT_S if became is not None and known else None
         self.in_force[EXPOSURE.name].change(self.exposure_s, began_s, self._clock.now_s())
 
-    def _check_exposure(self, exposure_s: float | None, words: str) -> None:
+    def _check_exposure(self, exposure_s: float | None, message: str) -> None:
         """Refuse an exposure time that is longer than a frame. Raises UnsupportedFormat."""
-        if self.rate_told and exposure_s is not None and exposure_s > self.period_s * (1 + RATE_TOLERANCE):
+        if self.rate_known and exposure_s is not None and exposure_s > self.period_s * (1 + RATE_TOLERANCE):
             raise UnsupportedFormat(
-                f"{words} {exposure_s:g} s, longer than a frame at the camera's {self.rate_hz:g} Hz "
+                f"{message} {exposure_s:g} s, longer than a frame at the camera's {self.rate_hz:g} Hz "
                 f"({self.period_s:.4g} s); a shorter one, or a lower rate, is expected",
                 device=self._name,
             )
@@ -209,7 +205,7 @@ def sensor_mode_of(node: Node, size_px: tuple[int, int]) -> SensorMode:
 
 
 def sizes_text(node: Node, code: str) -> str:
-    """Return the sizes of a format in words."""
+    """Return the sizes of a format, as text."""
     sizes, steps = node.sizes(code)
     if steps is not None:
         least_w, most_w, step_w, least_h, most_h, step_h = steps
@@ -218,7 +214,7 @@ def sizes_text(node: Node, code: str) -> str:
 
 
 def _set_rate(node: Node, options: CameraOptions, name: str) -> tuple[float, bool]:
-    """Set the rate, and check the answer if one was asked for; return whether there was one, too."""
+    """Set the rate, and check the answer if one was requested; return whether there was one, too."""
     if options.rate_hz is None:
         rate_hz = node.current_rate()
         return rate_hz or UNKNOWN_RATE_HZ, bool(rate_hz)

@@ -13,7 +13,7 @@ from drivers.dynamixel.link import Link
 from drivers.dynamixel.settings import dynamixel_settings
 from drivers.feetech import servos as feetech
 from drivers.feetech.head import feetech_settings
-from drivers.feetech.servos import open_link
+from drivers.feetech.servos import FeetechLink
 from drivers.hardware import DeviceSettings
 from mastctl.config import load_config
 from mastctl.service.masts import bounds_of
@@ -45,6 +45,6 @@ def error_registers(settings: DeviceSettings) -> dict[str, Any]:
         with closing(Link(options.port, options.baud)) as link:
             found = {name: dynamixel.facts(link, n).values["hardware_error"] for name, n in ids.items()}
     else:
-        with closing(open_link(options.port, options.baud)) as line:
+        with closing(FeetechLink(options.port, options.baud)) as line:
             found = {name: feetech.facts(line, n).values["status"] for name, n in ids.items()}
     return {name: value for name, value in found.items() if value}

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import threading
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from calib.geometry.mode import SensorMode
 from drivers.clock import SystemClock
 from drivers.errors import DriverError, NoFreshFrame
 from drivers.faults import CAMERA_WORDS, FaultPanel
-from drivers.interfaces import CameraInfo
-from drivers.sim.cameras import HangingCamera
+from drivers.sim.camera_settings import CameraSettings
+from drivers.sim.cameras import SimulatedCamera
 from drivers.simulation_clock import SimulationClock
 from hil_tests.drivers.fault_bench import PATIENCE_S, SIZE, START, Bench
 
@@ -76,7 +74,7 @@ def test_camera_frozen_repeats_a_picture_under_new_stamps(bench: Bench) -> None:
     np.testing.assert_array_equal(frames[0].image, before.image)
 
 
-@pytest.mark.parametrize("word", sorted(CAMERA_WORDS))
+@pytest.mark.parametrize("word", sorted(CAMERA_WORDS.keys() - {"hang"}))
 def test_a_cleared_camera_is_as_before(bench: Bench, word: str) -> None:
     bench.panel.set("cam_left", word, for_s=1.0)
     with contextlib.suppress(DriverError):
@@ -89,7 +87,7 @@ def test_a_cleared_camera_is_as_before(bench: Bench, word: str) -> None:
 
 
 CALLS: dict[str, Any] = {
-    "next_frame": lambda camera: camera.next_frame(START, 5.0),
+    "next_frame": lambda camera: camera.next_frame(-5.0, 5.0),
     "close": lambda camera: camera.close(),
     "recent_times": lambda camera: camera.recent_times(),
     "info": lambda camera: camera.info,
@@ -103,15 +101,11 @@ CALLS: dict[str, Any] = {
 def test_camera_hangs_in_the_named_call_until_the_fault_is_over(clock: Any, number: int) -> None:
     time_now = clock()
     panel = FaultPanel(time_now.now_s, ["cam_left"])
-    inner = SimpleNamespace(
-        name="cam_left",
-        next_frame=lambda *_: None,
-        close=lambda: None,
-        recent_times=list,
-        info=CameraInfo(period_s=0.1),
-        exposure_held=contextlib.nullcontext,
-    )
-    camera = HangingCamera(inner, SensorMode(SIZE), time_now, panel)  # type: ignore[arg-type]
+    grey = np.full(SIZE[::-1], 100.0, np.float32)
+    camera = SimulatedCamera(
+        "cam_left", CameraSettings(), SIZE, lambda *_: grey, lambda *_: None, time_now, panel,
+        time_now.now_s() - 10.0,
+    )  # fmt: skip
     panel.set("cam_left", "hang", call=number)
     for place, (name, call) in enumerate(CALLS.items(), 1):
         back = threading.Event()

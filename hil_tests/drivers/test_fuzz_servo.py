@@ -140,9 +140,9 @@ def test_a_units_answer_after_broken_lines_is_read_and_no_other_value(
     for at in range(0, len(stream), size):
         for got in splitter.feed(stream[at : at + size]):
             found = answer_of(got, query.letters)
-            value = number_of(found.text, query.words, True) if found is not None and found.good else None
+            value = number_of(found.text, query.terms, True) if found is not None and found.good else None
             taken.append((got.decode("latin-1").lower(), value))
     assert taken[-1][1] == number
     for text, value in taken:
         if value is not None:  # whatever digits the noise has changed
-            assert all(word in text for word in query.words) and f"{value:g}".lstrip("-")[:1] in text, text
+            assert all(word in text for word in query.terms) and f"{value:g}".lstrip("-")[:1] in text, text

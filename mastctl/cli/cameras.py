@@ -70,20 +70,20 @@ def camera_check(args: argparse.Namespace) -> Answer:
     from mastctl.setup.camera_check import CameraCheck
 
     with opened_camera(args) as camera:
-        capture, before = camera.capture, camera.counters
-        found = CameraCheck(args.camera, camera, SystemClock(), capture.format.size_px).run(args.seconds)
+        before = camera.counters
+        found = CameraCheck(args.camera, camera, SystemClock(), camera.format.size_px).run(args.seconds)
         after = camera.counters
         lost = {name: getattr(after, name) - getattr(before, name) for name in ("dropped", "damaged", "late")}
         found |= {
-            "driver": capture.identity.driver,
-            "card": capture.identity.card,
-            "bus": capture.identity.bus,
-            "format": capture.format.code,
-            "asked_rate_hz": 1 / capture.period_s,
+            "driver": camera.identity.driver,
+            "card": camera.identity.card,
+            "bus": camera.identity.bus,
+            "format": camera.format.code,
+            "asked_rate_hz": 1 / camera.period_s,
             **lost,
             **camera.abilities(),
         }
-        found["problems"] += [problem.message for problem in capture.problems]
+        found["problems"] += [problem.message for problem in camera.problems]
     return _check(found)
 
 
@@ -154,7 +154,7 @@ def camera_grab(args: argparse.Namespace) -> Answer:
     else:
         with opened_camera(args) as camera:
             taken = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)
-            facts = {"camera": camera.capture.identity.card, "bus": camera.capture.identity.bus}
+            facts = {"camera": camera.identity.card, "bus": camera.identity.bus}
         image, mid_s, window_s, sequence = taken.image, taken.mid_exposure_s, taken.exposure_s, taken.sequence
     facts |= {
         "sequence": str(sequence),

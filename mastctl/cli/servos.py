@@ -122,14 +122,14 @@ def _info(args: argparse.Namespace) -> Answer:
     with _line(args, bench) as link:
         found = bench.facts(link, args.id)
     title = f"Servo {found.servo_id}: {found.model}, firmware {found.firmware}"
-    rows = [(name, str(value), found.words.get(name, "")) for name, value in found.values.items()]
+    rows = [(name, str(value), found.meanings.get(name, "")) for name, value in found.values.items()]
     return Answer(
         {
             "id": found.servo_id,
             "model": found.model,
             "firmware": found.firmware,
             "registers": found.values,
-            "words": found.words,
+            "words": found.meanings,
         },
         Shown(title, ("register", "value", "meaning"), rows),
     )

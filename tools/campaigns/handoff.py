@@ -244,7 +244,7 @@ class Stage:
             scene = repeated(scene, count, natural, rng)
             return ProvokedView(scene, scene, sigma_px=float(rng.choice([CLICK_PX, 1.0])))
         elif self.kind == "shadow":
-            low = replace(self.usual, rocks=300, bricks=12, sun_elevation_rad=0.45)
+            low = self.usual.model_copy(update={"rocks": 300, "bricks": 12, "sun_elevation_rad": 0.45})
             by = float(rng.uniform(0.15, 0.7) * rng.choice([-1.0, 1.0]))
             contrast = float(rng.choice([1.0, 0.3, 0.1]))
             suns = (low, replace(low, sun_azimuth_rad=low.sun_azimuth_rad + by))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -226,7 +226,7 @@ def _drive(
         track, carried = moved_track(track, motion, covariance), motion.points(carried)
         if not relit and left_m < 4.0:
             sun = light.sun_azimuth_rad + SUN_MOVES_RAD
-            world.relight(build_scene(replace(light, sun_azimuth_rad=sun)))
+            world.relight(build_scene(light.model_copy(update={"sun_azimuth_rad": sun})))
             relit = True
         track, stop = _look(world, track, target, carried)
         stops.append(stop)

@@ -1,6 +1,6 @@
 """How long a simulated camera exposes, with what gain, and the loop that sets both from the pictures.
 
-A camera's own automatic exposure sees each frame, asked for or not, and what it decides shows some frames
+A camera's own automatic exposure sees each frame, requested or not, and what it decides shows some frames
 later. It is metered here on a coarse picture without noise, so it is a function of where the camera looked.
 """
 
@@ -23,7 +23,7 @@ FRAMES_KEPT = 64
 """So many frames are metered at most to catch up with the present."""
 
 CHANGES_S = 5.0
-"""So old may a frame be that is asked for after a change."""
+"""So old may a frame be that is requested after a change."""
 
 MOST_STEP = 4.0
 """A loop changes by no more than this factor a frame."""
@@ -93,7 +93,7 @@ class FixedExposure:
         return self._set[-1][1:]
 
     def longest_s(self, now_s: float) -> float:
-        """Return the longest exposure time of frames that are asked for at a moment."""
+        """Return the longest exposure time of frames that are requested at a moment."""
         return max(exposure_s for _, exposure_s, _ in self._recent(now_s))
 
     def change(self, exposure_s: float, gain: float, now_s: float) -> None:
@@ -108,7 +108,7 @@ class FixedExposure:
         return FrameExposure(exposure_s, gain, exposure_s * gain / self._amount_s * daylight)
 
     def _recent(self, now_s: float) -> tuple[tuple[float, float, float], ...]:
-        """What a frame may have been taken with that is asked for at a moment."""
+        """What a frame may have been taken with that is requested at a moment."""
         changes = self._set
         first = max(i for i, one in enumerate(changes) if i == 0 or one[0] < now_s - CHANGES_S)
         return changes[first:]

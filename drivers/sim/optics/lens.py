@@ -29,7 +29,7 @@ Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 MESH_PX = 8
-"""Between pixels whose range is asked for defocus, and whose angle is for falloff."""
+"""Between pixels whose range is computed for defocus, and whose angle is for falloff."""
 
 LEVEL_PX = 0.5
 """Blurs by discs of such steps are made, and mixed between."""
@@ -75,13 +75,7 @@ class LensSettings(DriverOptions):
 
 @dataclass(frozen=True)
 class SimulatedLens:
-    """One camera's lens.
-
-    Attributes
-    ----------
-    ranges
-        ``ranges(origins_m, directions)``: how far rays go in the site frame, metres, nan for sky.
-    """
+    """One camera's lens."""
 
     settings: LensSettings
     camera: CameraModel

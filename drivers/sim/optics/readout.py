@@ -34,10 +34,6 @@ class Noise:
 
     Attributes
     ----------
-    read_dn
-        Standard deviation in the dark, grey levels of 0..255.
-    shot_dn
-        Standard deviation that light adds at mid grey (128); grows as the root of the grey level.
     seed
         With ``camera`` and a frame's sequence number it fixes every pixel.
     """

@@ -147,7 +147,7 @@ class Shutter:
 
 
 class _Keys:
-    """The key views of one picture, drawn when first asked for."""
+    """The key views of one picture, drawn when first requested."""
 
     def __init__(
         self,

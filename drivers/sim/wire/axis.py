@@ -22,13 +22,12 @@ WARM_C = 35.0
 HOTTEST_C = 125.0
 """Where a temperature ramp ends."""
 
-_FAR_RAD = 1e4
 _FASTEST_RAD_PER_S = 100.0
 _STEEPEST_RAD_PER_S2 = 1e4
 
 
 class WireAxis:
-    """An axis that takes orders at times that do not run backwards, and can be asked about the past minute.
+    """An axis that takes orders at times that do not run backwards, and can be queried about the past minute.
 
     Safe from any thread.
 
@@ -37,8 +36,6 @@ class WireAxis:
     settings
         Encoder, backlash, sag and ringing; its acceleration is what ``halt`` brakes with. Counts, speed and
         approach are for ``to_count`` only; the range is not used here.
-    faults
-        The panel that is asked for faults of ``pan_tilt``; none when left out.
     number
         0 for pan, 1 for tilt: which faults concern it.
     resumes
@@ -94,15 +91,6 @@ class WireAxis:
 
         self._take(time_s, drive)
 
-    def velocity(self, time_s: float, velocity_rad_per_s: float, acceleration_rad_per_s2: float) -> None:
-        """Start to turn for ever at a speed (signed)."""
-        if velocity_rad_per_s == 0:
-            self.halt(time_s, acceleration_rad_per_s2)
-            return
-        speed = abs(velocity_rad_per_s)
-        far_rad = math.copysign(_FAR_RAD, velocity_rad_per_s)
-        self.goal(time_s, self._axis.motion.at(time_s)[0] + far_rad, speed, acceleration_rad_per_s2)
-
     def halt(self, time_s: float, acceleration_rad_per_s2: float | None = None) -> None:
         """Brake and hold."""
         with self._lock:
@@ -121,9 +109,7 @@ class WireAxis:
 
     def angle_rad(self, time_s: float) -> float:
         """Return where the motor is as its encoder has it, with the encoder's faults."""
-        with self._lock:
-            self._follow(time_s)
-            angle_rad = self._axis.motion.at(time_s)[0]
+        angle_rad = self._at(time_s).motion.at(time_s)[0]
         if fault := self._fault("wrong", time_s):
             angle_rad += fault.number("offset_rad")
         if fault := self._fault("drifting", time_s):
@@ -138,32 +124,24 @@ class WireAxis:
         return self._fault("silent", time_s) is not None
 
     def no_number(self, time_s: float) -> bool:
-        """Return whether its angle is told as none, where a device can tell that."""
+        """Return whether its angle is reported as none, where a device can report that."""
         return self._fault("not_a_number", time_s) is not None
 
     def velocity_rad_per_s(self, time_s: float) -> float:
         """Return how fast the motor turns."""
-        with self._lock:
-            self._follow(time_s)
-            return self._axis.motion.at(time_s)[1]
+        return self._at(time_s).motion.at(time_s)[1]
 
     def mechanical_rad(self, time_s: float) -> float:
         """Return what the cameras ride on: the load behind the backlash, less the sag, ringing."""
-        with self._lock:
-            self._follow(time_s)
-            return self._axis.mechanical_rad(time_s)
+        return self._at(time_s).mechanical_rad(time_s)
 
     def under_way(self, time_s: float) -> bool:
         """Return whether the motor has not come to rest where it was sent."""
-        with self._lock:
-            self._follow(time_s)
-            return time_s < self._axis.motion.end_s
+        return time_s < self._at(time_s).motion.end_s
 
     def settles(self, time_s: float) -> bool:
         """Return whether the motor turns or did so within the settings' ``settle_s``."""
-        with self._lock:
-            self._follow(time_s)
-            return time_s < self._axis.motion.stood_since_s + self.settings.settle_s
+        return time_s < self._at(time_s).motion.stood_since_s + self.settings.settle_s
 
     def end_s(self) -> float:
         """Return when the motor comes to rest, if nothing new happens."""
@@ -176,15 +154,13 @@ class WireAxis:
 
     def seized(self, time_s: float) -> bool:
         """Return whether the gears do not turn at all."""
-        with self._lock:
-            self._follow(time_s)
-            return self._jammed
+        self.follow(time_s)
+        return self._jammed
 
     def pressing(self, time_s: float) -> bool:
         """Return whether the motor pushes against an obstacle."""
-        with self._lock:
-            self._follow(time_s)
-            return self._pressing
+        self.follow(time_s)
+        return self._pressing
 
     def blocked(self, time_s: float) -> bool:
         """Return whether something keeps the motor from where it was sent."""
@@ -192,8 +168,14 @@ class WireAxis:
             self._follow(time_s)
             return self._order is not None and (self._jammed or self._pressing)
 
+    def _at(self, time_s: float) -> Axis:
+        """The axis as faults leave it until a moment."""
+        with self._lock:
+            self._follow(time_s)
+            return self._axis
+
     def follow(self, time_s: float) -> None:
-        """Let faults act until a moment; every question asked about the axis does so too."""
+        """Let faults act until a moment; every query of the axis does so too."""
         with self._lock:
             self._follow(time_s)
 

@@ -13,8 +13,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from types import TracebackType
-from typing import Literal, Protocol, TypeVar, runtime_checkable
+from typing import Literal, Protocol, TypeVar
 
 from drivers.clock import Clock
 from drivers.faults import PAN_TILT, Fault, FaultPanel
@@ -25,12 +24,12 @@ MOST_NOISE = 12
 """The longest garbage in front of a reply, bytes."""
 
 POLL_S = 0.005
-"""How often a device is asked for what it sends by itself, and the faults of the line are looked at."""
+"""How often a device is polled for what it sends by itself, and the faults of the line are looked at."""
 
 _BITS_PER_BYTE = 10  # 8N1: start, eight, stop
 
 Observer = Callable[[Literal["host", "device"], bytes, float], None]
-"""Called in the line's thread with who sent it, the bytes, and when they were through."""
+"""Called in the line's thread with the sender, the bytes, and when they were through."""
 
 _L = TypeVar("_L", bound="Line")
 
@@ -45,46 +44,23 @@ class Reply:
         From the end of what it answers: of the received packet, or of the reply before it in the sequence.
     sender
         The servo's id; 0 for a pan/tilt unit; below 0 for an adapter's echo, which no fault falls on.
+    late_s
+        By how much the host gets it late, by a fault; the line is free meanwhile.
     """
 
     data: bytes
     delay_s: float = 0.0
     sender: int = 0
-
-
-@dataclass(frozen=True)
-class Sent:
-    """Bytes as they go out.
-
-    Attributes
-    ----------
-    data, delay_s
-        As of ``Reply``.
-    late_s
-        By how much the host gets them late; the line is free meanwhile.
-    """
-
-    data: bytes
-    delay_s: float
     late_s: float = 0.0
 
 
-@runtime_checkable
-class Named(Protocol):
-    """A device whose replies bear the name of their sender."""
-
-    def renamed(self, data: bytes, servo_id: int) -> bytes:
-        """Return a reply as if another had sent it, with a checksum that fits."""
-        ...
-
-
 class LineFaults:
-    """The faults of one line, asked of a panel; without a panel there are none."""
+    """The faults of one line, taken from a panel; without a panel there are none."""
 
     def __init__(self, panel: FaultPanel | None, device: object = None) -> None:
         self._panel = panel
-        self._names = device if isinstance(device, Named) else None
-        self._held: list[Sent] = []  # a reply that waits to change places with the next one
+        self._renamed = getattr(device, "renamed", None)  # of a device whose replies name their sender
+        self._held: list[Reply] = []  # a reply that waits to change places with the next one
 
     def hung_up(self, time_s: float) -> bool:
         """Return whether the cable is pulled."""
@@ -94,15 +70,15 @@ class LineFaults:
         """Return whether the device has no power to hear anything."""
         return self._panel is not None and self._panel.find(PAN_TILT, "off", time_s) is not None
 
-    def apply(self, replies: Sequence[Reply], time_s: float) -> list[Sent]:
+    def apply(self, replies: Sequence[Reply], time_s: float) -> list[Reply]:
         """Return what goes out for the replies of one moment, in this order."""
         panel = self._panel
         if panel is None:
-            return [Sent(reply.data, reply.delay_s) for reply in replies]
-        sent: list[Sent] = []
+            return list(replies)
+        sent: list[Reply] = []
         for reply in replies:
             if reply.sender < 0:
-                sent.append(Sent(reply.data, reply.delay_s))
+                sent.append(reply)
                 continue
             if self.deaf(time_s) or panel.strikes(PAN_TILT, time_s):
                 continue
@@ -118,11 +94,11 @@ class LineFaults:
                 sent.append(replace(one, delay_s=0.0))
         return sent
 
-    def _damaged(self, panel: FaultPanel, reply: Reply, time_s: float) -> Sent:
+    def _damaged(self, panel: FaultPanel, reply: Reply, time_s: float) -> Reply:
         """A reply of another sender, with a wrong byte, cut short, with garbage in front, or late."""
         data, late_s = reply.data, 0.0
-        if (fault := panel.takes(PAN_TILT, "misnamed", time_s, reply.sender)) and self._names:
-            data = self._names.renamed(data, int(fault.number("as_id")))
+        if (fault := panel.takes(PAN_TILT, "misnamed", time_s, reply.sender)) and self._renamed:
+            data = self._renamed(data, int(fault.number("as_id")))
         if data and (fault := panel.takes(PAN_TILT, "corrupt", time_s, reply.sender)):
             place = _below(panel, fault, len(data))
             changed = data[place] ^ (1 + _below(panel, fault, 255))
@@ -136,7 +112,7 @@ class LineFaults:
             late_s += fault.number("delay_s")
         if fault := panel.takes(PAN_TILT, "late", time_s, reply.sender):
             late_s += fault.number("delay_s")
-        return Sent(data, reply.delay_s, late_s)
+        return replace(reply, data=data, late_s=late_s)
 
 
 def _below(panel: FaultPanel, fault: Fault, bound: int) -> int:
@@ -162,13 +138,6 @@ class WireDevice(Protocol):
     def poll(self, time_s: float) -> Sequence[Reply]:
         """Return what it sends by itself, or at last sends for an answer that it held back."""
         ...
-
-
-@runtime_checkable
-class ManyBauds(Protocol):
-    """A device that is a bus, with devices of several baud rates: it is told that of the host."""
-
-    host_baud: int | None
 
 
 class Line(ABC):
@@ -219,12 +188,7 @@ class Line(ABC):
     def __enter__(self: _L) -> _L:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.close()
 
     @abstractmethod
@@ -255,7 +219,7 @@ class Line(ABC):
         """What is left for the device of bytes that a host sends at a speed."""
         if not self._wire_time:
             return data
-        if isinstance(self.device, ManyBauds):
+        if hasattr(self.device, "host_baud"):  # a bus, with devices of several baud rates
             self.device.host_baud = host_baud
         return data if host_baud == self.device.baud else b""  # else framing errors only
 

@@ -11,22 +11,14 @@ from drivers.sim.wire.carrier import Reply
 from drivers.sim.wire.dynamixel_packets import BROADCAST, Instruction, InstructionParser
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
 from drivers.sim.wire.dynamixel_table import (
-    ACCESS,
     CRC_ERROR,
     DATA_LENGTH,
     INSTRUCTION_ERROR,
     InstructionRefused,
 )
 
-PING, READ, WRITE, REG_WRITE, ACTION, FACTORY_RESET, REBOOT, CLEAR, BACKUP = 1, 2, 3, 4, 5, 6, 8, 0x10, 0x20
-SYNC_READ, SYNC_WRITE, FAST_SYNC_READ, BULK_READ, BULK_WRITE, FAST_BULK_READ = (
-    0x82,
-    0x83,
-    0x8A,
-    0x92,
-    0x93,
-    0x9A,
-)
+PING, READ, WRITE, REBOOT = 1, 2, 3, 8
+SYNC_READ, SYNC_WRITE, BULK_READ, BULK_WRITE = 0x82, 0x83, 0x92, 0x93
 
 
 class DynamixelBus:
@@ -44,7 +36,7 @@ class DynamixelBus:
     Attributes
     ----------
     host_baud
-        Bits a second of the host, set by who knows it; a servo with another rate hears nothing. None: the
+        Bits a second of the host, set by the line; a servo with another rate hears nothing. None: the
         rate of the first servo.
     """
 
@@ -82,7 +74,7 @@ class DynamixelBus:
 
     @contextlib.contextmanager
     def held(self) -> Iterator[None]:
-        """Keep the line from the servos meanwhile, so that somebody else may do something to them."""
+        """Keep the line from the servos meanwhile, so that another thread may do something to them."""
         with self._lock:
             yield
 
@@ -99,9 +91,9 @@ class DynamixelBus:
             return []  # an answer that came back to the servos
         for servo in here:
             servo.feed(time_s)
-        if code in (SYNC_READ, FAST_SYNC_READ, BULK_READ, FAST_BULK_READ):
+        if code in (SYNC_READ, BULK_READ):
             wanted = _wanted(code, parameters) if instruction.packet_id == BROADCAST else []
-            return self._group_read(code, wanted, here, time_s)
+            return self._group_read(wanted, here, time_s)
         if code in (SYNC_WRITE, BULK_WRITE):
             if instruction.packet_id == BROADCAST:
                 _group_write(code, parameters, here, time_s)
@@ -143,40 +135,24 @@ class DynamixelBus:
         return _collided(replies)
 
     def _group_read(
-        self, code: int, wanted: list[tuple[int, int, int]], here: list[SimulatedServo], time_s: float
+        self, wanted: list[tuple[int, int, int]], here: list[SimulatedServo], time_s: float
     ) -> list[Reply]:
-        """Sync, bulk and fast reads, answered in the order of the list."""
-        fast = code in (FAST_SYNC_READ, FAST_BULK_READ)
-        total = sum(length + 4 for _, _, length in wanted)
-        if fast and total > packets.MAX_PACKET:
-            return []
-        blocks: list[tuple[int, int, bytes]] = []
+        """Sync and bulk reads, answered in the order of the list."""
         replies: list[Reply] = []
         for servo_id, address, length in wanted:
             found = [s for s in here if s.servo_id == servo_id and s.answers("read")]
-            if not found or (fast and not all(s.model.fast for s in found)):
-                if self.waits_for_predecessor or fast:
-                    break
-                continue
-            delay_s = found[0].return_delay_s
+            if not found and self.waits_for_predecessor:
+                break
             answers = []
             for servo in found:
                 error, data = 0, b""
                 try:
                     data = servo.read(address, length, time_s)
                 except InstructionRefused as refused:
-                    # A fast answer has fixed places, so the block is there, with an error and zeros.
-                    error, data = refused.error, bytes(length) if fast else b""
-                answers.append((error | servo.alert(), servo_id, data))
-            if fast:
-                blocks.append(answers[0])
-                replies.append(Reply(b"", delay_s, servo_id))
-            else:
-                packed = [Reply(packets.status_packet(i, e, d), delay_s, i) for e, i, d in answers]
-                replies += _collided(packed)
-        if fast:
-            pieces = packets.fast_status_packets(blocks, total)
-            return [Reply(p, r.delay_s, r.sender) for p, r in zip(pieces, replies, strict=True)]
+                    error = refused.error
+                answer = packets.status_packet(servo_id, error | servo.alert(), data)
+                answers.append(Reply(answer, found[0].return_delay_s, servo_id))
+            replies += _collided(answers)
         return replies
 
 
@@ -192,25 +168,12 @@ def _do(
             raise InstructionRefused(DATA_LENGTH)
         address, length = _word(parameters, 0), _word(parameters, 2)
         return b"" if broadcast else servo.read(address, length, time_s)
-    if code in (WRITE, REG_WRITE):
+    if code == WRITE:
         if len(parameters) < 3:
             raise InstructionRefused(DATA_LENGTH)
-        if code == WRITE:
-            servo.write(_word(parameters, 0), parameters[2:], time_s, by_group=group)
-        else:
-            servo.reg_write(_word(parameters, 0), parameters[2:], by_group=group)
-    elif code == ACTION:
-        servo.action(time_s)
+        servo.write(_word(parameters, 0), parameters[2:], time_s, by_group=group)
     elif code == REBOOT:
         servo.reboot(time_s)
-    elif group:
-        raise InstructionRefused(ACCESS)  # a group can write to the RAM area, no more
-    elif code == FACTORY_RESET:
-        servo.factory_reset(parameters, time_s, broadcast=broadcast)
-    elif code == CLEAR:
-        servo.clear(parameters, time_s)
-    elif code == BACKUP:
-        servo.backup(parameters, time_s)
     else:
         raise InstructionRefused(INSTRUCTION_ERROR)
     return b""
@@ -222,7 +185,7 @@ def _word(data: bytes, at: int) -> int:
 
 def _wanted(code: int, parameters: bytes) -> list[tuple[int, int, int]]:
     """Id, address and length for each servo of a sync or bulk read; what is left over is ignored."""
-    if code in (SYNC_READ, FAST_SYNC_READ):
+    if code == SYNC_READ:
         address, length = _word(parameters, 0), _word(parameters, 2)
         return [(servo_id, address, length) for servo_id in dict.fromkeys(parameters[4:])]
     whole = len(parameters) // 5 * 5
@@ -235,7 +198,7 @@ def _wanted(code: int, parameters: bytes) -> list[tuple[int, int, int]]:
 
 
 def _group_write(code: int, parameters: bytes, here: list[SimulatedServo], time_s: float) -> None:
-    """Write to each servo of a sync or bulk write; nobody answers, refused values are dropped."""
+    """Write to each servo of a sync or bulk write; none answers, refused values are dropped."""
     at = 4 if code == SYNC_WRITE else 0
     address, length = _word(parameters, 0), _word(parameters, 2)
     while at < len(parameters):

@@ -13,12 +13,10 @@ import math
 from drivers.sim.motion import Motion
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_models import SimulatedModel
-from drivers.sim.wire.dynamixel_table import ControlTable
-
-POSITION_MODES = frozenset({3, 4, 5})
+from drivers.sim.wire.dynamixel_table import MODES, POSITION_MODE, ControlTable
 
 STEP_RAD_PER_S2 = 60.0
-"""Acceleration where the profile asks for an infinite one (assumed; the manual gives none)."""
+"""Acceleration where the profile has an infinite one (assumed; the manual gives none)."""
 
 _IN_POSITION_RAD = 4 * math.tau / 4096  # the manual names no bound; this is four counts of an X
 _FOLLOWING_RAD = 40 * math.tau / 4096  # as above
@@ -51,7 +49,7 @@ class Drive:
 
     def _homing(self) -> int:
         offset = self._table["homing_offset"]
-        ignored = self._table["operating_mode"] == 3 and self._model.ram_from == 64
+        ignored = self._table["operating_mode"] == POSITION_MODE and self._model.ram_from == 64
         return 0 if ignored and abs(offset) > _HOMING_LIMIT else offset
 
     def _turned(self, angle_rad: float) -> float:
@@ -96,7 +94,7 @@ class Drive:
     def torque_on(self, time_s: float) -> None:
         """Hold where it is; goals are where it is and no velocity."""
         self.axis.halt(time_s)
-        if self._table["operating_mode"] == 3:
+        if self._table["operating_mode"] == POSITION_MODE:
             self.into_one_turn(time_s)
         self.rest(time_s)
         self._table["goal_position"] = self.position(time_s)
@@ -112,61 +110,26 @@ class Drive:
         self.axis.halt(time_s)
         self.rest(time_s)
 
-    def obey(self, name: str, time_s: float) -> None:
-        """Act on a goal that was written, if it is the operating mode's."""
-        mode = self._table["operating_mode"]
-        if name == "goal_position" and mode in POSITION_MODES:
-            if mode != 5 or self._table.get("goal_current", 0) != 0:
-                self._go(time_s)
-        elif name == "goal_velocity" and mode == 1:
-            self._turn(time_s, self._table[name] * self._model.velocity_unit_rad_per_s)
-        elif (name == "goal_pwm" and mode == 16) or (name == "goal_current" and mode == 0):
-            # Without a load both end at a share of the top speed; its torque is not modelled.
-            share = self._table[name] / max(1, self._table[name.replace("goal_", "") + "_limit"])
-            self._turn(time_s, share * self._top_rad_per_s())
-
     def _top_rad_per_s(self) -> float:
         return max(1, self._table["velocity_limit"]) * self._model.velocity_unit_rad_per_s
 
-    def _acceleration_rad_per_s2(self) -> float:
-        value = self._table["profile_acceleration"]
-        if value == 0 or self._timed():
-            return STEP_RAD_PER_S2
-        return value * self._model.acceleration_unit_rad_per_s2
-
-    def _timed(self) -> bool:
-        return bool(self._table["drive_mode"] & 4)
-
-    def _go(self, time_s: float) -> None:
-        """Start the profile to Goal Position."""
+    def go(self, time_s: float) -> None:
+        """Start the profile to Goal Position, if it is the operating mode's."""
+        if self._table["operating_mode"] not in MODES:
+            return
         angle = self._angle_rad(self._table["goal_position"])
         distance = abs(angle - self._motion.at(time_s)[0])
-        velocity = self._table["profile_velocity"]
+        velocity, units = self._table["profile_velocity"], self._table["profile_acceleration"]
         speed = min(velocity * self._model.velocity_unit_rad_per_s or math.inf, self._top_rad_per_s())
-        acceleration = self._acceleration_rad_per_s2()
-        ramped = self._table["profile_acceleration"] > 0
-        if self._timed() and velocity > 0 and distance > 0:
-            total_s = velocity / 1000
-            ramp_s = min(self._table["profile_acceleration"] / 1000, total_s / 2)
-            speed = distance / (total_s - ramp_s)
-            acceleration = speed / ramp_s if ramp_s > 0 else STEP_RAD_PER_S2
+        acceleration = units * self._model.acceleration_unit_rad_per_s2 or STEP_RAD_PER_S2
         if velocity == 0:
             self._profile = 0
-        elif not ramped:
+        elif units == 0:
             self._profile = 1
         else:
             self._profile = 3 if distance >= speed * speed / acceleration * (1 - 1e-9) else 2
         self._motion = self._motion.moved(time_s, [angle], speed, acceleration)
         self.axis.goal(time_s, angle, speed, acceleration)
-
-    def _turn(self, time_s: float, speed_rad_per_s: float) -> None:
-        """Turn for ever, in the direction that the servo calls positive."""
-        speed = self._direction() * speed_rad_per_s
-        acceleration = self._acceleration_rad_per_s2()
-        if self._timed() and self._table["profile_acceleration"] > 0:
-            change = abs(speed - self.axis.velocity_rad_per_s(time_s))
-            acceleration = max(change, 1e-6) / (self._table["profile_acceleration"] / 1000)
-        self.axis.velocity(time_s, speed, acceleration)
 
     # What the servo says about its motion
 
@@ -174,7 +137,7 @@ class Drive:
         return self._table["torque_enable"] == 1
 
     def _positioning(self) -> bool:
-        return self._on() and self._table["operating_mode"] in POSITION_MODES
+        return self._on() and self._table["operating_mode"] in MODES
 
     def _trajectory(self, time_s: float) -> tuple[float, float]:
         """Where the profile is and how fast; the axis itself where there is none."""

@@ -72,30 +72,6 @@ def renamed(data: bytes, servo_id: int) -> bytes:
     return front + crc16(front).to_bytes(2, "little")
 
 
-def fast_status_packets(blocks: list[tuple[int, int, bytes]], total: int) -> list[bytes]:
-    """Return the pieces of the one answer to a fast sync or bulk read, one piece a servo.
-
-    Each servo appends its block and the CRC of all bytes so far, those of earlier CRCs included. Nothing is
-    stuffed.
-
-    Parameters
-    ----------
-    total
-        Data bytes that were asked of all servos of the list, and 4 for each of them.
-    """
-    pieces: list[bytes] = []
-    crc = 0
-    for error, servo_id, data in blocks:
-        piece = bytes((error, servo_id)) + data
-        if not pieces:
-            piece = HEADER + bytes((BROADCAST,)) + (total + 1).to_bytes(2, "little") + b"\x55" + piece
-        crc = crc16(piece, crc)
-        tail = crc.to_bytes(2, "little")
-        crc = crc16(tail, crc)
-        pieces.append(piece + tail)
-    return pieces
-
-
 @dataclass(frozen=True)
 class Instruction:
     """One packet from the host; ``intact`` is False when its CRC does not match."""

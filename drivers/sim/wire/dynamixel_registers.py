@@ -5,7 +5,8 @@ ROBOTIS e-Manual (github.com/ROBOTIS-GIT/emanual), pages of each model; addresse
 ``.model`` tables of dynamixel-sdk (checked in hil_tests).
 
 A row is ``address size name access initial low high``. ``w`` is readable and writable, ``r`` read only.
-``initial`` is ``-`` where the servo computes the value or the manual gives none (then 0).
+``initial`` is ``-`` where the servo computes the value or the manual gives none (then 0). Gains, external
+ports and what a backup needs are left out.
 """
 
 from __future__ import annotations
@@ -55,7 +56,6 @@ X_EEPROM = """
  44 4 velocity_limit           w 200   0 1023
  48 4 max_position_limit       w 4095  0 4095
  52 4 min_position_limit       w 0     0 4095
- 60 1 startup_configuration    w 0     0 3
  63 1 shutdown                 w 52    0 63
 """
 X_RAM = """
@@ -64,13 +64,6 @@ X_RAM = """
  68 1 status_return_level      w 2     0 2
  69 1 registered_instruction   r 0
  70 1 hardware_error_status    r 0
- 76 2 velocity_i_gain          w 1920  0 16383
- 78 2 velocity_p_gain          w 100   0 16383
- 80 2 position_d_gain          w 0     0 16383
- 82 2 position_i_gain          w 0     0 16383
- 84 2 position_p_gain          w 800   0 16383
- 88 2 feedforward_2nd_gain     w 0     0 16383
- 90 2 feedforward_1st_gain     w 0     0 16383
  98 1 bus_watchdog             w 0     0 127
 100 2 goal_pwm                 w -     -32768 32767
 102 2 goal_current             w -     -32768 32767
@@ -89,18 +82,6 @@ X_RAM = """
 140 4 position_trajectory      r -     -2147483648 2147483647
 144 2 present_input_voltage    r -
 146 1 present_temperature      r -
-147 1 backup_ready             r 0
-"""
-X330_MORE = """
- 62 1 pwm_slope                w 140   1 255
-"""
-X540_MORE = """
- 56 1 external_port_mode_1     w 3     0 3
- 57 1 external_port_mode_2     w 3     0 3
- 58 1 external_port_mode_3     w 3     0 3
-152 2 external_port_data_1     w 0     0 4095
-154 2 external_port_data_2     w 0     0 4095
-156 2 external_port_data_3     w 0     0 4095
 """
 MX_MORE = """
  40 4 acceleration_limit       w 32767 0 32767
@@ -127,28 +108,14 @@ P_EEPROM = """
  44 4 velocity_limit           w 2920  0 2920
  48 4 max_position_limit       w 303454  -303750 303750
  52 4 min_position_limit       w -303454 -303750 303750
- 56 1 external_port_mode_1     w 3     0 3
- 57 1 external_port_mode_2     w 3     0 3
- 58 1 external_port_mode_3     w 3     0 3
- 59 1 external_port_mode_4     w 3     0 3
- 60 1 startup_configuration    w 0     0 3
  63 1 shutdown                 w 58    0 63
 """
 P_RAM = """
 512 1 torque_enable            w 0     0 1
 513 1 led_red                  w 0     0 255
-514 1 led_green                w 0     0 255
-515 1 led_blue                 w 0     0 255
 516 1 status_return_level      w 2     0 2
 517 1 registered_instruction   r 0
 518 1 hardware_error_status    r 0
-524 2 velocity_i_gain          w 0     0 32767
-526 2 velocity_p_gain          w 0     0 32767
-528 2 position_d_gain          w 0     0 32767
-530 2 position_i_gain          w 0     0 32767
-532 2 position_p_gain          w 0     0 32767
-536 2 feedforward_2nd_gain     w 0     0 32767
-538 2 feedforward_1st_gain     w 0     0 32767
 546 1 bus_watchdog             w 0     0 127
 548 2 goal_pwm                 w -     -32768 32767
 550 2 goal_current             w -     -32768 32767
@@ -167,11 +134,6 @@ P_RAM = """
 588 4 position_trajectory      r -     -2147483648 2147483647
 592 2 present_input_voltage    r -
 594 1 present_temperature      r -
-600 2 external_port_data_1     w 0     0 4095
-602 2 external_port_data_2     w 0     0 4095
-604 2 external_port_data_3     w 0     0 4095
-606 2 external_port_data_4     w 0     0 4095
-878 1 backup_ready             r 0
 """
 
 

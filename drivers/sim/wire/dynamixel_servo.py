@@ -10,14 +10,9 @@ from drivers.sim.wire.dynamixel_drive import Drive
 from drivers.sim.wire.dynamixel_models import SimulatedModel, model_named
 from drivers.sim.wire.dynamixel_registers import BAUD_RATES
 from drivers.sim.wire.dynamixel_table import (
-    DATA_LENGTH,
-    GOALS,
-    INSTRUCTION_ERROR,
-    RESULT_FAIL,
+    MODES,
     WATCHDOG_EXPIRED,
     ControlTable,
-    InstructionRefused,
-    RegisterChange,
 )
 
 ALERT = 0x80
@@ -32,8 +27,6 @@ OVERLOAD_S = 0.5
 
 _WATCHDOG_UNIT_S = 0.02
 _ANSWER_BITS = 120.0  # of an answer without data, and a byte to spare
-_CLEAR_KEY = bytes((0x01, 0x44, 0x58, 0x4C, 0x22))
-_BACKUP_KEY = b"\x43\x54\x52\x4c"
 
 
 class SimulatedServo:
@@ -43,15 +36,8 @@ class SimulatedServo:
 
     Parameters
     ----------
-    model
-        Its name, in any spelling that `dynamixel_models.model_named` takes.
     settings
         Initial values of registers, by name; those of the EEPROM outlast a reboot.
-
-    Attributes
-    ----------
-    mate
-        The other servo in its case, with which it shares the baud rate; None for a servo of one axis.
     """
 
     def __init__(
@@ -79,9 +65,6 @@ class SimulatedServo:
         self.table.values.update({"id": servo_id, **(settings or {})})
         self.drive = Drive(self.model, self.table, axis, time_s)
         self._axis = axis
-        self._backup: dict[str, int] = {}
-        self._backup_pointers: list[int] = []
-        self._registered: list[RegisterChange] = []
         self._raised = 0
         self.mate: SimulatedServo | None = None
         self._since_s: float | None = None
@@ -90,7 +73,7 @@ class SimulatedServo:
         self._starting = False
         self._start_registers(time_s)
 
-    # What the bus asks
+    # What the bus reads
 
     @property
     def servo_id(self) -> int:
@@ -168,93 +151,17 @@ class SimulatedServo:
 
     def write(self, address: int, data: bytes, time_s: float, *, by_group: bool = False) -> None:
         """Write at once, or raise Refused; ``by_group`` is a packet to the secondary id."""
-        self._apply(self._changes(address, data, by_group), time_s)
-
-    def reg_write(self, address: int, data: bytes, *, by_group: bool = False) -> None:
-        """Check a write and keep it for `action`, or raise Refused."""
-        self._registered = self._changes(address, data, by_group)
-        self.table["registered_instruction"] = 1
-
-    def action(self, time_s: float) -> None:
-        """Carry out what `reg_write` kept; raise Refused when there is nothing."""
-        if not self._registered:
-            raise InstructionRefused(INSTRUCTION_ERROR)
-        changes, self._registered = self._registered, []
-        self.table["registered_instruction"] = 0
-        self._apply(changes, time_s)
-
-    def reboot(self, time_s: float) -> None:
-        """Start anew: torque drops at once, errors are gone, the RAM area is as from the factory."""
-        self.table["torque_enable"] = 0
-        self.drive.torque_off(time_s)
-        self._boot(time_s)
-
-    def factory_reset(self, parameters: bytes, time_s: float, *, broadcast: bool) -> None:
-        """Reset the table: 0xFF all, 0x01 all but the id, 0x02 all but id and baud rate; then start anew."""
-        if len(parameters) != 1:
-            raise InstructionRefused(DATA_LENGTH)
-        kept = {0xFF: (), 0x01: ("id",), 0x02: ("id", "baud_rate")}.get(parameters[0])
-        if kept is None or (broadcast and parameters[0] == 0xFF):
-            raise InstructionRefused(RESULT_FAIL)
-        values = {name: self.table[name] for name in (*kept, "model_number", "firmware_version")}
-        self.table.values.update({r.name: r.initial for r in self.model.registers} | values)
-        self.table.reset_pointers()
-        self.reboot(time_s)
-
-    def clear(self, parameters: bytes, time_s: float) -> None:
-        """Bring the position back to one turn; refused while it moves."""
-        if parameters != _CLEAR_KEY or self.drive.moving(time_s):
-            raise InstructionRefused(RESULT_FAIL)
-        before = self.drive.position(time_s)
-        self.drive.into_one_turn(time_s)
-        self.table["goal_position"] += self.drive.position(time_s) - before
-
-    def backup(self, parameters: bytes, time_s: float) -> None:
-        """Store the EEPROM area and the settings of the control loop (1), or restore and start anew (2)."""
-        if self.table["torque_enable"] or parameters[1:] != _BACKUP_KEY or parameters[0] not in (1, 2):
-            raise InstructionRefused(RESULT_FAIL)
-        if "backup_ready" not in self.table.values:
-            raise InstructionRefused(INSTRUCTION_ERROR)
-        if parameters[0] == 1:
-            names = [r.name for r in self.model.registers if r.writable and self._is_kept(r.name)]
-            self._backup = {name: self.table[name] for name in names}
-            self._backup_pointers = list(self.table.pointers)
-            self.table["backup_ready"] = 1
-        elif not self._backup:
-            raise InstructionRefused(RESULT_FAIL)
-        else:
-            eeprom = {n: v for n, v in self._backup.items() if self._is_eeprom(n)}
-            self.table.values.update(eeprom)
-            self.reboot(time_s)
-
-    # Inside
-
-    def _is_eeprom(self, name: str) -> bool:
-        return self.model.by_name[name].address < self.model.ram_from
-
-    def _is_kept(self, name: str) -> bool:
-        return self._is_eeprom(name) or "gain" in name or name.startswith("profile_")
-
-    def _expired(self) -> bool:
-        return self.table["bus_watchdog"] == WATCHDOG_EXPIRED
-
-    def _changes(self, address: int, data: bytes, by_group: bool) -> list[RegisterChange]:
         locked = by_group or self.table["torque_enable"] == 1
-        return self.table.changes(address, data, locked=locked, expired=self._expired())
-
-    def _apply(self, changes: list[RegisterChange], time_s: float) -> None:
-        """Store accepted changes and act on them, goals last and once each."""
-        goals = []
-        for change in changes:
-            name = "" if change.register is None else change.register.name
+        changes = self.table.changes(address, data, locked=locked, expired=self._expired())
+        aimed = False
+        for register, value in changes:
+            name = register.name
             if name == "torque_enable":
-                self._torque(change.value == 1, time_s)
+                self._torque(value == 1, time_s)
                 continue
-            if name in GOALS and self._expired():
-                continue  # an action that was registered before the watchdog expired
-            self.table.apply(change)
-            if name in GOALS:
-                goals.append(name)
+            self.table[name] = value
+            if name == "goal_position":
+                aimed = True
             elif name == "operating_mode":
                 self._reset_mode(time_s)
             elif name == "drive_mode":
@@ -264,20 +171,22 @@ class SimulatedServo:
                 if self.mate is not None:
                     self.mate.table["baud_rate"] = self.table["baud_rate"]
                     self.mate._retune_s = self._retune_s
-        for name in goals:
-            if not self.table["torque_enable"] and self.table["drive_mode"] & 8:
-                self._torque_by_goal(name, time_s)
-            if self.table["torque_enable"]:
-                self.drive.obey(name, time_s)
+        if aimed and self.table["torque_enable"]:
+            self.drive.go(time_s)
 
-    def _torque_by_goal(self, name: str, time_s: float) -> None:
-        """Torque On by Goal Update: keep the goal that switches the torque on."""
-        goal = self.table[name]
-        self._torque(True, time_s)
-        self.table[name] = goal
+    def reboot(self, time_s: float) -> None:
+        """Start anew: torque drops at once, errors are gone, the RAM area is as from the factory."""
+        self.table["torque_enable"] = 0
+        self.drive.torque_off(time_s)
+        self._boot(time_s)
+
+    # Inside
+
+    def _expired(self) -> bool:
+        return self.table["bus_watchdog"] == WATCHDOG_EXPIRED
 
     def _torque(self, on: bool, time_s: float) -> None:
-        """Switch the torque; after a shutdown it stays off without a word, only the alert bit tells."""
+        """Switch the torque; after a shutdown it stays off silently, only the alert bit shows."""
         if on == bool(self.table["torque_enable"]):
             return
         if on and self.table["hardware_error_status"] & self.table["shutdown"]:
@@ -293,7 +202,7 @@ class SimulatedServo:
         """A new operating mode: the profile and the limits of the goals are reset."""
         self.table["profile_velocity"] = self.table["profile_acceleration"] = 0
         self._reset_goals(time_s)
-        if self.table["operating_mode"] in (3, 4):
+        if self.table["operating_mode"] in MODES:
             self.drive.into_one_turn(time_s)
             self.table["goal_position"] = self.drive.position(time_s)
 
@@ -307,11 +216,8 @@ class SimulatedServo:
     def _boot(self, time_s: float) -> None:
         """Everything that is not EEPROM as from the factory; deaf for a while."""
         for register in self.model.registers:
-            if register.address >= self.model.ram_from and register.name != "backup_ready":
+            if register.address >= self.model.ram_from:
                 self.table[register.name] = register.initial
-        if self.model.ram_from == 64:
-            self.table.reset_pointers()
-        self._registered = []
         self._raised = 0
         self._since_s = None
         self._started_s = self._fed_s = self._retune_s = time_s + BOOT_S
@@ -320,13 +226,6 @@ class SimulatedServo:
     def _start_registers(self, time_s: float) -> None:
         self.drive.into_one_turn(time_s)
         self._reset_goals(time_s)
-        startup = self.table.get("startup_configuration", 0)
-        if startup & 2 and self._backup:
-            self.table.values.update({n: v for n, v in self._backup.items() if not self._is_eeprom(n)})
-            if self.model.ram_from == 64:
-                self.table.pointers = list(self._backup_pointers)
-        if startup & 1:
-            self._torque(True, time_s)
 
     def _voltage(self, time_s: float) -> int:
         return round(10 * self.model.voltage_v * self._axis.supply(time_s))
@@ -355,7 +254,7 @@ class SimulatedServo:
             "moving": lambda t: self.drive.moving(t),
             "moving_status": lambda t: self.drive.moving_status(t),
             "present_pwm": lambda t: round(self.drive.effort(t) * self.table["pwm_limit"]),
-            "present_current": lambda t: round(self.drive.effort(t) * self._current_limit()),
+            "present_current": lambda t: round(self.drive.effort(t) * self.table["current_limit"]),
             "present_load": lambda t: round(self.drive.effort(t) * 1000),
             "present_velocity": lambda t: self.drive.velocity(t),
             "present_position": lambda t: self.drive.position(t),
@@ -364,9 +263,3 @@ class SimulatedServo:
             "present_input_voltage": lambda t: self._voltage(t),
             "present_temperature": lambda t: round(self._axis.temperature_c(t)),
         }
-
-    def _current_limit(self) -> int:
-        """The largest current: what current-based position control is given, else the limit."""
-        if self.table["operating_mode"] == 5:
-            return abs(self.table["goal_current"])
-        return self.table["current_limit"]

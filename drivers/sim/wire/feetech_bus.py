@@ -83,7 +83,7 @@ class FeetechBus:
     Attributes
     ----------
     host_baud
-        Bits a second of the host, set by who knows it; a servo with another rate hears nothing.
+        Bits a second of the host, set by the line; a servo with another rate hears nothing.
     """
 
     renamed = staticmethod(renamed)
@@ -151,7 +151,7 @@ class FeetechBus:
 
     @staticmethod
     def _sync_write(parameters: bytes, here: list[SimulatedFeetechServo], time_s: float) -> None:
-        """Write the same cells of several servos; nobody answers."""
+        """Write the same cells of several servos; none answers."""
         address, length = parameters[:2]
         for at in range(2, len(parameters) - length, length + 1):
             for servo in here:

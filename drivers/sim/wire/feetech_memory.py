@@ -32,10 +32,6 @@ STS_ROWS = """
 16 2 max_torque          w 1000  0 1000
 18 1 phase               w 12    0 254
 19 1 unload_condition    w 44    0 254
-20 1 led_condition       w 47    0 254
-21 1 p_gain              w 32    0 254
-22 1 d_gain              w 32    0 254
-23 1 i_gain              w 0     0 254
 24 2 start_force         w 16    0 1000
 26 1 cw_dead             w 1     0 32
 27 1 ccw_dead            w 1     0 32
@@ -49,7 +45,7 @@ STS_ROWS = """
 37 1 speed_p_gain        w 10    0 100
 38 1 overcurrent_time    w 200   0 254
 39 1 speed_i_gain        w 10    0 254
-40 1 torque_enable       w 0     0 128
+40 1 torque_enable       w 0     0 1
 41 1 acceleration        w 0     0 254
 42 2 goal_position       w -     0 65535
 44 2 goal_time           w 0     0 65535
@@ -83,10 +79,6 @@ SCS_ROWS = """
 16 2 max_torque          w 1000  0 1000
 18 1 phase               w 0     0 254
 19 1 unload_condition    w 36    0 254
-20 1 led_condition       w 36    0 254
-21 1 p_gain              w 15    0 254
-22 1 d_gain              w 15    0 254
-23 1 i_gain              w 0     0 254
 24 2 start_force         w 40    0 1023
 26 1 cw_dead             w 2     0 32
 27 1 ccw_dead            w 2     0 32
@@ -132,10 +124,6 @@ class SimulatedFeetech:
 
     Attributes
     ----------
-    big_end
-        Whether the high byte of a word comes first.
-    turn_rad, counts
-        What its encoder measures over how many counts.
     sync_read
         Whether it answers a read of several servos at once.
     """
@@ -163,8 +151,8 @@ class SimulatedFeetech:
 def _cells(text: str) -> tuple[Cell, ...]:
     found = []
     for line in text.split("\n"):
-        if words := line.split():
-            address, size, name, access, initial, *ends = words
+        if row := line.split():
+            address, size, name, access, initial, *ends = row
             low, high = (int(end) for end in ends or (0, 0))
             start = 0 if initial == "-" else int(initial)
             found.append(Cell(int(address), int(size), name, access == "w", start, low, high))

@@ -20,7 +20,6 @@ FASTEST_COUNTS = 3400
 STEEPEST_RAD_PER_S2 = 60.0
 """Of an acceleration of 0, and of an SCS, which has none (assumed)."""
 
-SET_MIDDLE = 128
 _PROTECTIVE_UNIT_S = 0.01
 
 
@@ -31,12 +30,8 @@ class SimulatedFeetechServo:
 
     Parameters
     ----------
-    model
-        A name of `feetech_memory.MODELS`.
     settings
         Initial values of its memory by name; those of the EEPROM outlast the power switch.
-    speed_unit_counts
-        Counts a second of one unit of its speed: 1, or 50 in some firmware.
     """
 
     def __init__(
@@ -151,9 +146,7 @@ class SimulatedFeetechServo:
                 continue
             word = data[at : at + cell.size]
             value = int.from_bytes(word, "big" if self.model.big_end else "little")
-            if cell.name == "torque_enable" and value == SET_MIDDLE and "offset" in self.memory:
-                self._set_middle(time_s)
-            elif cell.low <= value <= cell.high:
+            if cell.low <= value <= cell.high:
                 self._put(cell.name, value, cell.address, time_s)
                 moved = moved or cell.name in ("goal_position", "torque_enable")
         if moved and self.memory["torque_enable"] == 1:
@@ -170,12 +163,6 @@ class SimulatedFeetechServo:
             self.eeprom_writes.append(name)
             if not self.memory["lock"]:
                 self._kept[name] = value
-
-    def _set_middle(self, time_s: float) -> None:
-        """Make where it stands the middle, by the offset in the EEPROM."""
-        raw = self._position(time_s) + self._offset()
-        off = raw - self.model.counts // 2
-        self._put("offset", abs(off) | (0x800 if off < 0 else 0), 31, time_s)
 
     def _offset(self) -> int:
         """The offset: 11 bits and a sign."""

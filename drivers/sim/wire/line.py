@@ -76,8 +76,6 @@ class PtyLine(_KernelLine):
     ----------
     clock
         Time for the device: one that runs by itself (``SystemClock``), since the line waits in real time.
-    faults
-        Asked for faults of the line; none when left out.
     link
         A stable path to make, a symbolic link to the terminal; one of the line's own when left out.
     wire_time
@@ -174,8 +172,6 @@ class TcpLine(_KernelLine):
     ----------
     device, clock, faults, wire_time, observer
         As of ``PtyLine``; by default bytes take no time, since the network is faster than the device's line.
-    host, port
-        Where to listen; port 0 is any free one.
     """
 
     def __init__(

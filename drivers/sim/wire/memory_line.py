@@ -18,20 +18,7 @@ ROOM_BYTES = 4096
 
 
 class MemoryLine(Line):
-    """A serial line in memory; a context manager.
-
-    Parameters
-    ----------
-    clock
-        Time for the device, and what the line and its host wait on.
-    faults, wire_time, observer
-        As of ``PtyLine``.
-
-    Attributes
-    ----------
-    path
-        What a host gives to `open`.
-    """
+    """A serial line in memory; a context manager."""
 
     path = PATH
 
@@ -99,15 +86,7 @@ class MemoryLine(Line):
 
 
 class MemoryEnd:
-    """The host's end of a line in memory (`drivers.serial_line.ByteLine`); closing twice does no harm.
-
-    Attributes
-    ----------
-    port, baud, byte_s
-        As of `SerialLine`.
-    state
-        ``open``, ``hung up`` or ``closed``.
-    """
+    """The host's end of a line in memory (`drivers.serial_line.ByteLine`); closing twice does no harm."""
 
     def __init__(self, line: MemoryLine, clock: Clock, baud: int, device: str) -> None:
         self.port = line.path
@@ -160,5 +139,5 @@ class MemoryEnd:
 
     def _check(self, doing: str) -> None:
         if self.state != "open":
-            words = f"{self.port} {self.state} (unplugged?)"
-            raise LineLost(words, device=self._device, detail={"port": self.port, "while": doing})
+            message = f"{self.port} {self.state} (unplugged?)"
+            raise LineLost(message, device=self._device, detail={"port": self.port, "while": doing})

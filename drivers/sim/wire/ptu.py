@@ -1,7 +1,7 @@
 """A simulated FLIR / Directed Perception pan/tilt unit on a line: its ASCII protocol, byte by byte.
 
 What the unit does is known in `drivers.sim.wire.ptu_unit`. Wording follows the manuals and what drivers of
-real units parse; where no source gives any (C, user limits, step modes) it is like its neighbours'.
+real units parse; where no source gives any (user limits, step modes) it is like its neighbours'.
 Only the commands that drivers need are known; others are refused as illegal.
 """
 
@@ -22,11 +22,6 @@ from drivers.sim.wire.ptu_unit import CommandRefused, PtuUnit
 BAUD_RATES = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 _WORDS = re.compile(r"([A-Z]+)([+-]?\d+)?")
 _STEP_NAMES = {"F": "FULL", "H": "HALF", "Q": "QUARTER", "E": "EIGHTH", "A": "AUTO"}
-_LIMIT_MODES = {
-    "E": "Limit bounds are ENABLED (soft limits enabled)",
-    "D": "Limit bounds are DISABLED (hard limits only: use care)",
-    "U": "Limit bounds are USER DEFINED (user limits enabled)",
-}
 
 _Plain = Callable[[PtuUnit, float], str | None]
 
@@ -34,14 +29,14 @@ ANSWER_S = 0.001
 """From the end of a command to its answer (assumed)."""
 
 BANNER = b"\r\n### FLIR Motion Control Systems pan-tilt unit\r\n"
-"""What an E series unit says to whoever connects by TCP (the wording differs with the firmware)."""
+"""What an E series unit says to a host that connects by TCP (the wording differs with the firmware)."""
 
 _LONGEST = 100  # bytes of one command; the controller's buffer (D46 manual 7.3.2)
 
 
-def answer(unit: PtuUnit, words: bytes, time_s: float) -> str:
+def answer(unit: PtuUnit, command: bytes, time_s: float) -> str:
     """Carry out one command and return its answer, ``*`` or ``!`` and text."""
-    text = words.decode("ascii", "replace").upper()
+    text = command.decode("ascii", "replace").upper()
     try:
         text_back = _carry_out(unit, text, time_s)
     except CommandRefused as refusal:
@@ -64,7 +59,7 @@ def _carry_out(unit: PtuUnit, text: str, time_s: float) -> str | None:
         return resolution.carry_out(unit, unit.axes[name[0]], number, time_s)
     if name[0] == "W" and name[1:] in unit.axes and number is None:
         axis = unit.axes[name[1]]
-        return _value(unit, "{axis} in {value} step mode", axis, _STEP_NAMES[axis.mode])
+        return f"{axis.name} in {_STEP_NAMES[axis.mode]} step mode"
     raise _illegal()
 
 
@@ -72,47 +67,40 @@ def _illegal() -> CommandRefused:
     return CommandRefused("Illegal Command Entered")
 
 
-def _value(unit: PtuUnit, words: str, axis: PtuAxis, value: object) -> str:
-    """A query's answer: words with the value in them, or the value alone."""
-    return words.format(axis=axis.name, value=value) if unit.verbose else str(value)
-
-
 @dataclass(frozen=True)
 class _Quantity:
     """A quantity of an axis: reported without a number, set with one, unless it can only be read."""
 
-    words: str
+    sentence: str
     value: Callable[[PtuAxis, float], object]
     put: Callable[[PtuUnit, PtuAxis, int, float], None] | None = None
 
     def carry_out(self, unit: PtuUnit, axis: PtuAxis, number: int | None, time_s: float) -> str | None:
         """Report or set it."""
         if number is None:
-            return _value(unit, self.words, axis, self.value(axis, time_s))
+            return self.sentence.format(axis=axis.name, value=self.value(axis, time_s))
         if self.put is None:
             raise _illegal()
         self.put(unit, axis, number, time_s)
         return None
 
 
-_E_SERIES_RESOLUTION = _Quantity("{value} seconds arc per position", lambda a, t: f"{a.told_arcsec:.6f}")
+_E_SERIES_RESOLUTION = _Quantity("{value} seconds arc per position", lambda a, t: f"{a.reported_arcsec:.6f}")
 
-_RESOLUTION = _Quantity(  # 185.142857 is told as 185.1428
-    "{value} seconds arc per {axis} position", lambda a, t: f"{math.floor(a.told_arcsec * 1e4) / 1e4:.4f}"
+_RESOLUTION = _Quantity(  # 185.142857 is reported as 185.1428
+    "{value} seconds arc per {axis} position", lambda a, t: f"{math.floor(a.reported_arcsec * 1e4) / 1e4:.4f}"
 )
 
 
 # What follows P or T.
 _QUANTITIES: Mapping[str, _Quantity] = {
-    "P": _Quantity("Current {axis} position is {value}", lambda a, t: a.told_position(t), PtuUnit.go),
+    "P": _Quantity("Current {axis} position is {value}", lambda a, t: a.reported_position(t), PtuUnit.go),
     "O": _Quantity("Target {axis} position is {value}", lambda a, t: a.target, PtuUnit.go_by),
     "S": _Quantity(
         "Target {axis} speed is {value} positions/sec", lambda a, t: a.now.speed, PtuUnit.set_speed
     ),
     "U": _Quantity("Maximum {axis} speed is {value} positions/sec", lambda a, t: a.now.fastest),
-    "L": _Quantity(
-        "Minimum {axis} speed is {value} positions/sec", lambda a, t: a.now.slowest, PtuUnit.set_slowest
-    ),
+    "L": _Quantity("Minimum {axis} speed is {value} positions/sec", lambda a, t: a.now.slowest),
     "A": _Quantity(
         "{axis} acceleration is {value} positions/sec^2",
         lambda a, t: a.now.acceleration,
@@ -144,18 +132,13 @@ _PLAIN: Mapping[str, _Plain] = {
     "I": lambda u, t: u.immediate(t),
     "H": lambda u, t: u.halt(t),
     "R": lambda u, t: u.reset(t),
-    "C": lambda u, t: "PTU is in independent control mode",
     "CI": lambda u, t: None,
-    "L": lambda u, t: _LIMIT_MODES[u.limit_mode],
     "LE": _switch("limit_mode", "E"),
-    "LD": _switch("limit_mode", "D"),
     "LU": _switch("limit_mode", "U"),
     "V": lambda u, t: u.model.version,
     "O": lambda u, t: f"Input {u.supply_v(t):.0f} VDC @ {u.temperature_c(t) * 1.8 + 32:.0f} degF",
     "EE": _switch("echo", True),
-    "ED": _switch("echo", False),
-    "FV": _switch("verbose", True),
-    "FT": _switch("verbose", False),
+    "FV": lambda u, t: None,  # it always answers in sentences
     "DS": lambda u, t: u.save(),
 }
 
@@ -164,13 +147,6 @@ class SimulatedPtu:
     """A unit on a line (``drivers.sim.wire.line.WireDevice``).
 
     Raises BadOptions for a model, step mode or baud rate that does not exist.
-
-    Parameters
-    ----------
-    model
-        A name of ``drivers.sim.wire.ptu_axis.MODELS``.
-    step_mode
-        F, H, Q, E or A; as delivered when left out.
     """
 
     def __init__(
@@ -215,7 +191,7 @@ class SimulatedPtu:
 
     @property
     def banner(self) -> bytes:
-        """What it says to whoever connects by TCP."""
+        """What it says to a host that connects by TCP."""
         return BANNER if self._unit.model.e_series else b""
 
     def receive(self, data: bytes, time_s: float) -> Sequence[Reply]:
@@ -239,10 +215,10 @@ class SimulatedPtu:
             if end is None:
                 del self._received[_LONGEST:]
                 break
-            words, delimiter = bytes(self._received[:end]), bytes(self._received[end : end + 1])
+            command, delimiter = bytes(self._received[:end]), bytes(self._received[end : end + 1])
             del self._received[: end + 1]
-            echo = words + delimiter if unit.echo else b""
-            framed = self._framed(answer(unit, words, time_s)).data if words else b""
+            echo = command + delimiter if unit.echo else b""
+            framed = self._framed(answer(unit, command, time_s)).data if command else b""
             if unit.busy is not None:
                 framed = b""  # later
             if echo + framed:

@@ -50,14 +50,8 @@ class PtuModel:
 
     Attributes
     ----------
-    version
-        What ``V`` answers.
     half_step_arcsec
         One half step of either axis, arc seconds.
-    fastest, slowest
-        Largest and smallest speed, a second.
-    step_mode
-        As delivered: a key of ``STEPS``.
     e_series
         Answers as an E series unit: a line feed in front of every answer, no echo at power-up, six decimals,
         and the banner over TCP.
@@ -116,14 +110,8 @@ class PtuAxis:
 
     Parameters
     ----------
-    name
-        ``Pan`` or ``Tilt``.
-    model
-        The unit's.
     sign
         1 or -1: whether positions grow with the axis angle.
-    step_mode
-        A key of ``STEPS``.
     known
         Whether the unit knows its own gear ratio without a reset.
     """
@@ -155,7 +143,7 @@ class PtuAxis:
         self.user_low, self.user_high = self.limits()
         self.target = 0
         self.slaved: int | None = None
-        self.told_limit = True  # whether the limit where it stands has been told by !P or !T
+        self.limit_reported = True  # whether the limit where it stands has been reported by !P or !T
         self._sweep: list[int] = []
 
     @property
@@ -164,8 +152,8 @@ class PtuAxis:
         return self._model.half_step_arcsec * STEPS[self.mode] * ARCSEC_RAD
 
     @property
-    def told_arcsec(self) -> float:
-        """One position as PR and TR tell it, arc seconds."""
+    def reported_arcsec(self) -> float:
+        """One position as PR and TR report it, arc seconds."""
         half = self._model.half_step_arcsec
         if not self.known and self._model.unsure_arcsec is not None:
             half = self._model.unsure_arcsec
@@ -191,8 +179,8 @@ class PtuAxis:
         """Return where the unit believes the axis to be."""
         return round(self._sign * self.axis.angle_rad(time_s) / self.step_rad)
 
-    def told_position(self, time_s: float) -> int | str:
-        """Return the position as the unit tells it."""
+    def reported_position(self, time_s: float) -> int | str:
+        """Return the position as the unit reports it."""
         return "nan" if self.axis.no_number(time_s) else self.position(time_s)
 
     def resting(self, time_s: float) -> bool:
@@ -204,7 +192,7 @@ class PtuAxis:
         self.target = position
         low, high = self.switches()
         stop = max(low, min(high, position))
-        self.told_limit = low <= position <= high
+        self.limit_reported = low <= position <= high
         self._drive(time_s, stop, self.now.speed if speed is None else speed)
 
     def change_speed(self, time_s: float, speed: int) -> None:
@@ -218,7 +206,7 @@ class PtuAxis:
         """Brake and hold."""
         self._sweep = []
         self.slaved = None
-        self.told_limit = True
+        self.limit_reported = True
         self.axis.halt(time_s, self.now.acceleration * self.step_rad)
         self.target = round(self._sign * self.axis.rest_rad() / self.step_rad)
 
@@ -227,11 +215,11 @@ class PtuAxis:
         low, high = self.limits()
         self._sweep = [low, high, 0]
         self.slaved = None
-        self.told_limit = True
+        self.limit_reported = True
         self._drive(time_s, low, self._reset_speed)
 
     def follow_reset(self, time_s: float, hit: Callable[[], None]) -> None:
-        """Go on with a reset when a limit is reached; ``hit`` is told of each."""
+        """Go on with a reset when a limit is reached; ``hit`` is called for each."""
         if not self._sweep or self.axis.under_way(time_s) or self.axis.blocked(time_s):
             return
         reached = self._sweep.pop(0)
@@ -245,9 +233,9 @@ class PtuAxis:
 
     def at_limit(self, time_s: float) -> bool:
         """Return once that the axis has come to rest at a limit that it was not meant to stop at."""
-        if self.told_limit or self._sweep or self.axis.under_way(time_s) or self.axis.blocked(time_s):
+        if self.limit_reported or self._sweep or self.axis.under_way(time_s) or self.axis.blocked(time_s):
             return False
-        self.told_limit = True
+        self.limit_reported = True
         return True
 
     def _drive(self, time_s: float, position: int, speed: int) -> None:

@@ -1,4 +1,4 @@
-"""What a simulated pan/tilt unit is and does: two axes, its modes, limits and memory. No bytes, few words.
+"""What a simulated pan/tilt unit is and does: two axes, its modes, limits and memory. No bytes.
 
 Positions are steps, so the unit's angles are as fine as its step. Pan grows to the left and tilt upwards, as
 the manuals have it. A unit without encoders counts its steps and does not notice that an axis is held; here
@@ -7,7 +7,6 @@ the count always is where the motor is, so that every fault of an axis can be se
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
@@ -21,25 +20,16 @@ NOMINAL_V = 24.0
 
 
 class CommandRefused(Exception):
-    """What the unit does not do, in the words that it answers behind the ``!``."""
+    """What the unit does not do, with the text that it answers behind the ``!``."""
 
 
 class PtuUnit:
     """A unit.
 
-    Parameters
-    ----------
-    model, pan, tilt, step_mode, baud
-        As ``drivers.sim.wire.ptu.SimulatedPtu``.
-
     Attributes
     ----------
-    axes
-        ``P`` and ``T``.
     limit_mode
-        E, D or U: the factory's limits, none, the user's.
-    slaved
-        Whether goals wait for I.
+        E or U: the factory's limits, the user's.
     busy
         Whether the last command is not through yet, as a function of the time that tells when it is; None if
         nothing is under way. Meanwhile the unit answers nothing.
@@ -59,7 +49,6 @@ class PtuUnit:
         self.tilt = PtuAxis("Tilt", model, tilt, 1, step_mode, known)
         self.axes: Mapping[str, PtuAxis] = {"P": self.pan, "T": self.tilt}
         self.echo = not model.e_series
-        self.verbose = True
         self.limit_mode = "E"
         self.slaved = False
         self.busy: Callable[[float], bool] | None = None
@@ -87,8 +76,6 @@ class PtuUnit:
 
     def allowed(self, axis: PtuAxis) -> tuple[float, float]:
         """Return the positions that may be commanded."""
-        if self.limit_mode == "D":
-            return -math.inf, math.inf
         return axis.limits() if self.limit_mode == "E" else (axis.user_low, axis.user_high)
 
     def go(self, axis: PtuAxis, position: int, time_s: float) -> None:
@@ -121,14 +108,6 @@ class PtuUnit:
         if speed < axis.now.slowest:
             raise CommandRefused(f"{axis.name} speed cannot be less than {axis.now.slowest} positions/sec")
         axis.change_speed(time_s, speed)
-
-    def set_slowest(self, axis: PtuAxis, speed: int, time_s: float) -> None:
-        """Set the lower bound of speeds. Raises Refused."""
-        if speed < self.model.slowest:
-            raise CommandRefused(f"Motor speed cannot be less than {self.model.slowest} pos/sec")
-        if speed > axis.now.fastest:
-            raise _too_fast(axis)
-        axis.now = replace(axis.now, slowest=speed)
 
     def set_acceleration(self, axis: PtuAxis, acceleration: int, time_s: float) -> None:
         """Set the acceleration. Raises Refused."""

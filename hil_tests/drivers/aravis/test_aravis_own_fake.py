@@ -93,7 +93,7 @@ def test_it_is_found_by_its_serial_number_and_by_its_name(fake: Start) -> None:
     ]
     by_serial = {key: value for key, value in OPTIONS.items() if key != "address"} | {"serial": "A2"}
     camera = open_camera(by_serial, name="cam")
-    assert camera.capture.words == "Aravis Fake A2"
+    assert camera.camera_name == "Aravis Fake A2"
     camera.close()
     with pytest.raises(NoCamera, match=r"cam: no camera with serial number B9 answers; there are: .*A2"):
         open_camera({**by_serial, "serial": "B9"}, name="cam")

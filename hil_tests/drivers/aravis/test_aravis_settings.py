@@ -117,7 +117,7 @@ def test_bounds_are_the_cameras_and_a_change_turns_the_automatic_off(device: Gig
 def test_a_rounded_value_is_told_and_a_refused_one_too(device: GigeCamera) -> None:
     camera = opened()
     (note,) = camera.adjust({"exposure_s": 0.004315})
-    assert note == "cam: exposure_s is 0.00432 where 0.004315 was asked for: the camera's nearest"
+    assert note == "cam: exposure_s is 0.00432 where 0.004315 was requested: the camera's nearest"
     device.refuses.add(gige_camera.EXPOSURE)
     with pytest.raises(BadSetting, match="cam: exposure_s was not changed: "):
         camera.adjust({"exposure_s": 0.008, "gain": 5.0})
@@ -150,10 +150,10 @@ def test_a_camera_that_is_opened_again_has_the_values_of_the_run_time(device: Gi
     camera = opened(features={"Focus": 40})
     camera.adjust({"exposure_s": 0.009, "gain": 7.0, "focus": 55.0})
     device.unplug()
-    until(lambda: camera.capture.newest.lost, "the loss")
+    until(lambda: camera.newest.lost, "the loss")
     again = GigeCamera(ADDRESS, more=True)
     try:
-        until(lambda: not camera.capture.newest.lost, "the return")
+        until(lambda: not camera.newest.lost, "the return")
         frame = taken(camera, again)
     finally:
         again.unplug()

@@ -14,11 +14,11 @@ import pytest
 
 from drivers.dynamixel.link import Link
 from drivers.dynamixel.models import MODELS
-from drivers.dynamixel.packets import Part
 from drivers.dynamixel.registers import ControlItem
 from drivers.errors import BadOptions, BadReply, LineLost, NoReply, Refused
 from drivers.serial_line import SerialLine
 from drivers.servo_bus.bus import Bus
+from drivers.servo_bus.port import Part
 from drivers.sim.wire.carrier import Reply
 from drivers.sim.wire.dynamixel_packets import Instruction
 from hil_tests.drivers.dynamixel.scripted_servos import BAUD_RATE, number, says, scripted

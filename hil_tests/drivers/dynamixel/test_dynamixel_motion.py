@@ -75,9 +75,9 @@ def test_standing_away_from_the_goal_is_not_settled_and_is_told() -> None:
     goal = bench.plan(0.5)
     bench.be(goal - 30, status=0, for_s=0.5)
     assert not bench.motion.settled(bench.now_s)
-    assert bench.motion.stuck_words(bench.now_s) == ""
+    assert bench.motion.stuck_fault(bench.now_s) == ""
     bench.be(goal - 30, status=0, for_s=1.0)
-    assert bench.motion.stuck_words(bench.now_s) == (
+    assert bench.motion.stuck_fault(bench.now_s) == (
         f"pan stands still {30 * COUNT_RAD:.4f} rad from its goal: something holds it"
     )
 

@@ -12,9 +12,8 @@ from typing import Any
 
 import pytest
 
-from drivers.dynamixel.head import DynamixelHead
+from drivers.dynamixel.head import DynamixelHead, Pair
 from drivers.dynamixel.link import Link
-from drivers.dynamixel.pair import Pair
 from drivers.dynamixel.servo import Servo
 from drivers.errors import DriverError, LineLost, NoReply
 from drivers.servo_bus.bus import Bus
@@ -255,7 +254,7 @@ def test_a_closing_ends_in_its_time_beside_an_axis_that_never_stands(
         under_way(it, head)
         for axis in bad:
             fault(it, axis)
-        it.axes[0].velocity(it.now_s(), 0.2, 10.0)
+        it.axes[0].goal(it.now_s(), 1e4, 0.2, 10.0)
         it.axes[0]._take = lambda *_: None  # type: ignore[method-assign]
         closing_s = it.now_s()
         head.close()
@@ -389,13 +388,14 @@ def test_a_failed_move_whose_goals_went_out_brakes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with opened() as (it, head):
-        true_send = Pair.send
+        true_send = Pair.send_goals
 
-        def send(pair: Pair, values: Any) -> None:
-            true_send(pair, values)
+        def send(pair: Pair, speeds: Sequence[int]) -> Sequence[int]:
+            sent = true_send(pair, speeds)
             mute(it, 0)
+            return sent
 
-        monkeypatch.setattr(Pair, "send", send)
+        monkeypatch.setattr(Pair, "send_goals", send)
         with pytest.raises(NoReply):
             head.move(2.0, 0.9)
         it.panel.clear()

@@ -47,9 +47,10 @@ def test_both_have_the_makers_codes_of_baud_rates() -> None:
 
 
 def test_both_have_the_makers_status_bits() -> None:
-    assert set(driver.STATUS_WORDS) == set(STATUS_BITS)
+    assert set(driver.STATUS_FAULTS) == set(STATUS_BITS)
     for bit, word in STATUS_BITS.items():
-        assert word in driver.status_words(bit), bit
+        (fault,) = driver.status_faults(bit)
+        assert word in fault, bit
     assert STATUS_BITS == {
         feetech_servo.VOLTAGE: "voltage", feetech_servo.SENSOR: "angle", feetech_servo.HEAT: "heat",
         feetech_servo.CURRENT: "current", feetech_servo.OVERLOAD: "overload",
@@ -76,7 +77,7 @@ def test_both_count_as_the_maker_does() -> None:
         ours, theirs = driver.MODELS[name], feetech_memory.model_named(name)
         count_rad = math.radians(turn_deg) / counts
         assert ours.count_rad == pytest.approx(count_rad) and theirs.count_rad == pytest.approx(count_rad)
-        assert (ours.order == "big", theirs.big_end) == (big, big)
+        assert (ours.is_scs, theirs.big_end) == (big, big)
     assert driver.MODELS["STS3215"].current_unit_A == 0.0065
     assert driver.MODELS["STS3215"].acceleration_unit_rad_per_s2 == pytest.approx(100 * math.tau / 4096)
     assert feetech_servo.STEP_ACCELERATION == 100

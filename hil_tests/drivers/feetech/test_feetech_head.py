@@ -25,7 +25,9 @@ from drivers.errors import (
 from drivers.faults import FaultPanel
 from drivers.feetech import servos as workshop
 from drivers.feetech.head import FeetechHead, FeetechServo, halt, open_head
-from drivers.feetech.servos import FeetechLink, open_link
+from drivers.feetech.servos import FeetechLink
+from drivers.servo_bus.bench import ServoBench
+from drivers.servo_bus.exchange import BusLink
 from drivers.sim.axis import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.feetech_bus import FeetechBus
@@ -278,9 +280,10 @@ def cli(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Bench]:
     with bench() as it:
         monkeypatch.setattr(heads, "SYSTEM", tmp_path / "no_such")
         monkeypatch.setattr(heads, "_home", lambda: tmp_path)
-        asked = {"questions": None, "clock": it.clock, "open_line": it.line.open}
-        monkeypatch.setattr(open_link, "__kwdefaults__", asked)
-        monkeypatch.setattr(workshop.scan, "__defaults__", (it.clock, it.line.open))
+        monkeypatch.setattr(
+            BusLink.__init__, "__kwdefaults__", {"clock": it.clock, "open_line": it.line.open}
+        )
+        monkeypatch.setattr(ServoBench.scan, "__defaults__", (it.clock, it.line.open))
         yield it
 
 
@@ -323,7 +326,7 @@ def test_a_change_of_id_that_fails_leaves_the_eeprom_locked(
             raise mishap
 
     with bench() as it:
-        link = open_link(it.line.path, 1_000_000, 0.05, clock=it.clock, open_line=it.line.open)
+        link = FeetechLink(it.line.path, 1_000_000, 0.05, clock=it.clock, open_line=it.line.open)
         monkeypatch.setattr(FeetechLink, "write_unanswered", lost)
         told = "the servo is left with the id 1 or 7 at 1000000 baud: 'mastctl rig servo scan memory"
         with pytest.raises(WrongDevice if mishap else NoReply, match=told):

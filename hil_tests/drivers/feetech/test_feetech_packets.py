@@ -8,7 +8,7 @@ from __future__ import annotations
 import pytest
 
 from drivers.feetech import servos as packets
-from drivers.servo_bus.port import StatusPacket
+from drivers.servo_bus.port import Part, StatusPacket
 from drivers.sim.wire.feetech_bus import FeetechInstruction, FeetechInstructionParser, packet, renamed
 
 OF_THE_SDK = {
@@ -24,15 +24,15 @@ OF_THE_SDK = {
 def ours() -> dict[str, bytes]:
     """The same by the driver."""
     sts, scs = packets.MODELS["STS3215"], packets.MODELS["SCS0009"]
-    goal = sts.registers["goal_position"]
-    told = [goal.encode(count, "little") + bytes((0, 0, 0x60, 9)) for count in (2048, 2058)]
-    write, read = packets.WRITE, packets.FORMAT.read_parameters(56, 8)
+    goal, of_scs = (model.registers["goal_position"] for model in (sts, scs))
+    told = [goal.encode(count) + bytes((0, 0, 0x60, 9)) for count in (2048, 2058)]
+    write, read = packets.WRITE, bytes((56, 8))
     return {
         "ping": packets.instruction_packet(1, packets.PING),
         "read 56, 8 bytes": packets.instruction_packet(1, packets.READ, read),
-        "write 2048 to 42": packets.instruction_packet(1, write, b"\x2a" + goal.encode(2048, sts.order)),
-        "write 500 to 42, SCS": packets.instruction_packet(1, write, b"\x2a" + goal.encode(500, scs.order)),
-        "sync write": packets.sync_write_packet(41, {1: b"\x32" + told[0], 2: b"\x32" + told[1]}),
+        "write 2048 to 42": packets.instruction_packet(1, write, b"\x2a" + goal.encode(2048)),
+        "write 500 to 42, SCS": packets.instruction_packet(1, write, b"\x2a" + of_scs.encode(500)),
+        "sync write": packets.group_write_packet([Part(n, 41, 7, b"\x32" + told[n - 1]) for n in (1, 2)]),
         "sync read": packets.sync_read_packet(56, 8, (1, 2)),
     }
 
@@ -78,7 +78,7 @@ def test_a_reply_in_pieces_is_awaited_and_a_broken_one_dropped() -> None:
 def test_minus_is_a_bit_and_an_scs_is_big_endian() -> None:
     registers = packets.MODELS["STS3215"].registers
     offset, position = registers["offset"], registers["present_position"]
-    assert offset.encode(-100, "little") == (0x800 | 100).to_bytes(2, "little")
-    assert offset.decode(offset.encode(-100, "little"), "little") == -100
-    assert position.decode(bytes((0x05, 0x80)), "little") == -5
-    assert position.decode(bytes((0x01, 0xF4)), packets.MODELS["SCS0009"].order) == 500
+    assert offset.encode(-100) == (0x800 | 100).to_bytes(2, "little")
+    assert offset.decode(offset.encode(-100)) == -100
+    assert position.decode(bytes((0x05, 0x80))) == -5
+    assert packets.SCS["present_position"].decode(bytes((0x01, 0xF4))) == 500

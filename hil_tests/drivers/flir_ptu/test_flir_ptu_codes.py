@@ -36,7 +36,6 @@ REPLIES = [
 
 REFUSALS = [
     (D300_MANUAL, "PP3200", "! Maximum allowable Pan position is 3090"),
-    (D300_MANUAL, "PL20", "! Motor speed cannot be less than 31 pos/sec"),
 ]
 
 
@@ -47,7 +46,7 @@ def test_a_reply_of_a_real_unit_gives_its_number(
     answer = answer_of(line.encode(), command)
     assert query.letters == command
     assert answer is not None and answer.good, source
-    assert number_of(answer.text, query.words, verbose=True) == number, source
+    assert number_of(answer.text, query.terms, verbose=True) == number, source
 
 
 @pytest.mark.parametrize(("source", "command", "reply"), REFUSALS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from drivers.servo_bus.course import ServoSample
-from drivers.servo_bus.rest import Rest, come_to_rest, rests
+from drivers.servo_bus.servo import Rest, come_to_rest, rests
 from drivers.simulation_clock import SimulationClock
 
 START_S = 100.0
@@ -51,7 +51,7 @@ def test_an_axis_that_falls_slowly_is_held_where_it_comes_to_rest(counts_per_s: 
     axis = Axis(counts_per_s, 1)
     with axis.clock.at_work():
         axis.rests_s = START_S + 0.23
-        goal = come_to_rest(axis.look, axis.held.__setitem__, (0, 4095), axis.clock)
+        goal = come_to_rest(axis.look, axis.held.__setitem__, int, axis.clock)
         assert axis.clock.now_s() >= axis.rests_s
         assert goal == axis.held["goal_position"] == axis.counts()
 

@@ -9,7 +9,7 @@ from drivers.clock import ManualClock
 from drivers.errors import BadFrame
 from drivers.faults import FaultPanel
 from drivers.sim.camera_settings import CameraSettings
-from drivers.sim.cameras import SelfExposedCamera, SimulatedCamera
+from drivers.sim.cameras import SimulatedCamera
 from drivers.sim.optics.exposure import ExposureSettings
 from mastctl.devices.frames import checked
 
@@ -34,12 +34,11 @@ def camera(scene: Scene, **changes: object) -> tuple[SimulatedCamera, ManualCloc
     clock = ManualClock(START)
     settings = CameraSettings(**{"seed": 3, **changes})  # type: ignore[arg-type]
     panel = FaultPanel(clock.now_s, ["cam_left"])
-    usual = (
+    made = SimulatedCamera(
         "cam_left", settings, SIZE, lambda b, e: scene.light(b), lambda n, t: None, clock, panel, START,
+        metered=scene.light,
     )  # fmt: skip
-    if settings.exposure.auto:
-        return SelfExposedCamera(scene.light, *usual), clock
-    return SimulatedCamera(*usual), clock
+    return made, clock
 
 
 def mean_dn(device: SimulatedCamera, clock: ManualClock) -> float:
@@ -63,11 +62,9 @@ def test_gain_brings_its_noise_and_too_much_light_saturates() -> None:
         checked(frame, "cam_left", SIZE, 0.0, clock.now_s())
 
 
-def automatic(scene: Scene, **changes: object) -> tuple[SelfExposedCamera, ManualClock]:
+def automatic(scene: Scene, **changes: object) -> tuple[SimulatedCamera, ManualClock]:
     exposure = ExposureSettings(**{"reference_s": 0.008, "auto": True, **changes})  # type: ignore[arg-type]
-    device, clock = camera(scene, exposure=exposure)
-    assert isinstance(device, SelfExposedCamera)
-    return device, clock
+    return camera(scene, exposure=exposure)
 
 
 @pytest.mark.parametrize(("level", "gained"), [(200.0, False), (8.0, True)])

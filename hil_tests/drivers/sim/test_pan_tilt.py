@@ -75,8 +75,8 @@ def test_every_goal_is_approached_from_one_side() -> None:
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ("ptu_d46", r"no head 'ptu_d46'; did you mean 'ptu_d46_70'"),
-        ({"preset": "dynamixel_x", "backlash": 0.1}, r"no key 'backlash'; did you mean 'backlash_rad'"),
+        ("ptu_d46", r"preset: 'ptu_d46', .*; did you mean 'ptu_d46_70'"),
+        ({"preset": "dynamixel_x", "backlash": 0.1}, r"backlash: unknown key; .* 'backlash_rad'"),
         ({"approach_rad": 1e-5}, r"does not take up the backlash"),
     ],
 )

@@ -126,10 +126,10 @@ def test_a_brick_is_met_where_its_numbers_put_it(placed: Scene) -> None:
     ("scene", "told"),
     [
         ({"boards": 3}, "simulation.scene.boards is 3, expected a list"),
-        ({"rocks": [{"x_m": 30, "y_m": 0}]}, r"rocks\[0\].x_m is 30.0, expected a number from -28 to 28"),
+        ({"rocks": [{"x_m": 30, "y_m": 0}]}, r"rocks\[0\].x_m: 30 where a number from -28 to 28 is"),
         (
             {"boards": [{"x_m": 3, "y_m": 0, "kind": "checker"}]},
-            "kind is 'checker'",
+            "kind: 'checker' where",
         ),
         (
             {"boards": [{"x_m": 3, "y_m": 0, "kind": "charuco", "dictionary": "DICT_4X4_50", "rows": 20}]},

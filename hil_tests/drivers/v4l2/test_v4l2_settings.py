@@ -32,7 +32,7 @@ def test_a_frame_has_a_changed_setting_once_it_surely_shows(
 
         def told(exposure_s: float = 0.036) -> dict[str, float | None]:
             seen.arrive(sensor.shoot(PERIOD_S, exposure_s))
-            newest = camera.capture.newest.frame
+            newest = camera.newest.frame
             return {} if newest is None else dict(newest.settings)
 
         for _ in range(SETTLE_FRAMES + 1):
@@ -130,7 +130,7 @@ def test_a_value_the_camera_changed_or_refused_is_reported(
 
         monkeypatch.setattr(settings, "set_value", clamps)
         (note,) = seen.camera.adjust({"gain": 200.0})
-        assert "gain is 64 where 200 was asked for" in note
+        assert "gain is 64 where 200 was requested" in note
         assert {one.name: one.value for one in seen.camera.settings()}["gain"] == 64
         seen.node.refused = (FOCUS.id,)
         with pytest.raises(BadSetting, match="focus was not changed: focus does not take 40"):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from drivers.newest import ExposureWindow
 from drivers.v4l2 import abi
-from drivers.v4l2.stamps import Spacing, StampCheck, StampRule, StampWindow, Timing, exposure_window
+from drivers.v4l2.stamps import Spacing, StampCheck, StampRule, Timing, exposure_window
 from drivers.values_set import ValuesSet
 
 START = abi.BUF_FLAG_TIMESTAMP_MONOTONIC | 0x10000
@@ -44,11 +45,11 @@ def test_an_exposure_longer_than_the_frame_is_taken_as_it_is() -> None:
 
 def test_a_frame_that_nothing_bounds_has_no_window() -> None:
     first, second = Timing(None, None, None, None), Timing(None, None, 0.04, None)
-    assert exposure_window(EXACT, first, START, 100.0, 100.1) == StampWindow(100.0, 100.1)
+    assert exposure_window(EXACT, first, START, 100.0, 100.1) == ExposureWindow(100.0, 100.1)
     for timing, rule, flags in ((first, UVC, START), (first, EXACT, END), (second, EXACT, END)):
         assert exposure_window(rule, timing, flags, 100.0, 100.1) is None
     known = Timing(0.01, 0.01, None, None)
-    assert exposure_window(UVC, known, START, 100.0, 100.1) == StampWindow(99.99, 100.1)
+    assert exposure_window(UVC, known, START, 100.0, 100.1) == ExposureWindow(99.99, 100.1)
     assert exposure_window(EXACT, known, END, 100.0, 100.1) is None
 
 

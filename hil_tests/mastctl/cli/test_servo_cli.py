@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
-from drivers.dynamixel import workshop
-from drivers.dynamixel.link import Link
+from drivers.servo_bus.bench import ServoBench
+from drivers.servo_bus.exchange import BusLink
 from drivers.sim.axis import AxisSettings
 from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
@@ -45,8 +45,8 @@ def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Bench]:
     it = Bench()
     monkeypatch.setattr(heads, "SYSTEM", tmp_path / "no_such")
     monkeypatch.setattr(heads, "_home", lambda: tmp_path)  # the name of a line in memory is a true line's
-    monkeypatch.setattr(Link.__init__, "__kwdefaults__", {"clock": it.clock, "open_line": it.line.open})
-    monkeypatch.setattr(workshop.scan, "__defaults__", (it.clock, it.line.open))
+    monkeypatch.setattr(BusLink.__init__, "__kwdefaults__", {"clock": it.clock, "open_line": it.line.open})
+    monkeypatch.setattr(ServoBench.scan, "__defaults__", (it.clock, it.line.open))
     with it.clock.at_work(), it.line:
         yield it
 

@@ -101,7 +101,7 @@ class HdmiOutput:
         buffer.bytesused = pixels.size
         fcntl.ioctl(self._fd, abi.VIDIOC_QBUF, buffer)
 
-    def _buffer(self, index: int) -> abi.Buffer:
+    def _buffer(self, index: int) -> ctypes.Structure:
         return abi.Buffer(
             index=index, type=BUF_TYPE_VIDEO_OUTPUT, memory=abi.MEMORY_MMAP, field=abi.FIELD_NONE
         )

@@ -66,7 +66,7 @@ def test_a_disconnected_camera_is_lost_and_comes_back_while_the_other_goes_on(ca
     fresh(camera)
     fresh(other)
     inject(0, "disconnect")
-    until(lambda: camera.capture.lost or camera.counters.reopened, "the camera is lost")
+    until(lambda: camera.lost or camera.counters.reopened, "the camera is lost")
     fresh(other)
     until(lambda: camera.counters.reopened >= 1, "the camera is opened again")
     fresh(camera)
@@ -80,11 +80,11 @@ def test_a_camera_that_is_unplugged_is_told_and_found_under_its_new_number() -> 
     holder = os.open(f"/dev/{numbers_before[BUS[0]]}", os.O_RDWR)  # keeps the old number taken
     fresh(camera)
     (VIVID / "unbind").write_text("vivid.0")
-    until(lambda: camera.capture.lost, "the camera is lost")
+    until(lambda: camera.lost, "the camera is lost")
     with pytest.raises(NoCamera, match="left"):
         camera.next_frame(time.monotonic(), NET_S)
     time.sleep(0.5)
-    assert camera.capture.lost
+    assert camera.lost
     (VIVID / "bind").write_text("vivid.0")
     until(lambda: camera.counters.reopened == 1, "the camera is opened again")
     fresh(camera)
@@ -132,7 +132,7 @@ def test_a_stable_link_is_followed_to_the_node(tmp_path: Path) -> None:
         {**{k: v for k, v in options().items() if k != "bus"}, "device": str(link)}, name="left"
     )
     fresh(camera)
-    assert camera.capture.identity.bus == BUS[1]
+    assert camera.identity.bus == BUS[1]
     camera.close()
 
 

@@ -61,7 +61,7 @@ def test_a_rate_that_the_camera_lacks_is_told_with_those_it_has() -> None:
 def test_a_camera_without_exposure_and_focus_says_so_and_works() -> None:
     camera = open_camera(options(exposure_s=0.01, focus=30, gain=20), name="left")
     try:
-        told = [problem.message for problem in camera.capture.problems]
+        told = [problem.message for problem in camera.problems]
         frame = camera.next_frame(time.monotonic(), 5.0)
     finally:
         camera.close()

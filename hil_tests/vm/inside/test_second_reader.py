@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drivers.clock import SystemClock
 from drivers.v4l2 import find
-from drivers.v4l2.capture import Capture
+from drivers.v4l2.camera import V4l2Camera
 from drivers.v4l2.controls import list_controls
 from drivers.v4l2.find import Address
 from drivers.v4l2.options import parse_options
@@ -39,19 +39,17 @@ def by_v4l2_ctl(file: Path, code: str, size_px: tuple[int, int], index: int = 0)
 
 
 def our_bytes(count: int, index: int = 0, **more: object) -> list[NDArray[np.uint8]]:
-    """The bytes of some frames one after the other, as our capture thread holds them."""
-    capture = Capture(
-        parse_options(options(index, **more), "left"), "left", SystemClock(), lambda format, data: data.copy()
-    )
+    """The bytes of some frames one after the other, as the camera's thread holds them."""
+    camera = V4l2Camera(parse_options(options(index, **more), "left"), "left", SystemClock())
+    camera._convert = lambda format, raw: raw.copy()
     after_s, found = time.monotonic(), []
     try:
         for _ in range(count):
-            taken = capture.take(after_s, 10.0)
-            assert taken is not None
-            after_s = taken[0].window.begin_s
-            found.append(taken[1])
+            taken = camera.next_frame(after_s, 10.0)
+            after_s = taken.exposure_began_s
+            found.append(taken.image)
     finally:
-        capture.close()
+        camera.close()
     return found
 
 

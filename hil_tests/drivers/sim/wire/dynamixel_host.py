@@ -116,11 +116,11 @@ class Host:
         assert result == 0, result
         return int(error)
 
-    def sync_read(self, address: int, size: int, *ids: int, fast: bool = False) -> tuple[int, dict[int, int]]:
+    def sync_read(self, address: int, size: int, *ids: int) -> tuple[int, dict[int, int]]:
         """The result, and the values of those that the SDK calls available."""
         group = GroupSyncRead(self.port, self.sdk, address, size)
         for servo_id in ids:
             assert group.addParam(servo_id)
-        result = group.fastSyncRead() if fast else group.txRxPacket()
+        result = group.txRxPacket()
         there = [i for i in ids if group.isAvailable(i, address, size)]
         return result, {i: group.getData(i, address, size) for i in there}

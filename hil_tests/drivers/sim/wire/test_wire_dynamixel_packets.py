@@ -11,7 +11,6 @@ from drivers.sim.wire.dynamixel_packets import (
     Instruction,
     InstructionParser,
     crc16,
-    fast_status_packets,
     packet,
     status_packet,
     stuffed,
@@ -67,21 +66,6 @@ def test_instructions_of_the_manual(text: str) -> None:
 def test_answers_of_the_manual(text: str) -> None:
     servo_id, error, data = STATUS[text]
     assert status_packet(servo_id, error, bytes.fromhex(data)) == clean(text)
-
-
-def test_fast_answers_of_the_manual() -> None:
-    sync = [(0, 3, clean("A6000000")), (0, 7, clean("1F080000")), (0, 4, clean("FF030000"))]
-    assert fast_status_packets(sync, 3 * 8) == [
-        clean("FFFFFD00FE1900550003A60000008408"),
-        clean("00071F08000016CA"),
-        clean("0004FF030000D19E"),
-    ]
-    bulk = [(0, 3, clean("A6000000")), (0, 7, clean("A501")), (0, 4, clean("1F"))]
-    assert fast_status_packets(bulk, 8 + 6 + 5) == [
-        clean("FFFFFD00FE1400550003A600000067A4"),
-        clean("0007A5012474"),
-        clean("00041FD9C1"),
-    ]
 
 
 bodies = st.lists(st.sampled_from([0xFF, 0xFD, 0xFE, 0x00, 0x01]), min_size=1, max_size=24).map(bytes)

@@ -31,14 +31,8 @@ def test_the_makers_easy_sdk_drives_each_kind_of_model(model: str) -> None:
         connector = Connector(line.path, 1_000_000)
         motor = connector.createMotor(7)
         assert motor.model_name == f"{model}.model"
-        motor.setOperatingMode(OperatingMode.VELOCITY)
-        motor.enableTorque()
-        motor.setGoalVelocity(20)
-        until(lambda: motor.getPresentVelocity() == 20, "its speed")
-        motor.setGoalVelocity(0)
         with pytest.raises(DxlRuntimeError):
-            motor.setGoalVelocity(motor.getVelocityLimit() + 1)
-        motor.disableTorque()
+            motor.setOperatingMode(OperatingMode.VELOCITY)
         motor.setMaxPositionLimit(3000)
         assert motor.getMaxPositionLimit() == 3000
         motor.setOperatingMode(OperatingMode.POSITION)
