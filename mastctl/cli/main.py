@@ -31,14 +31,14 @@ log = logging.getLogger(__name__)
 
 OVERVIEW: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "a running daemon and its mast": {
-        "run": ("service", "run the daemon; its address is one line on stdout when it is ready"),
+        "run": ("service", "run the daemon; its address is a line on stdout when it is ready"),
         "status": ("service", "show the state of a daemon, its operations or events"),
         "point": ("steering", "point a camera at something and measure the residual, or jog"),
         "track": ("steering", "follow a target while the rover moves"),
         "snapshot": ("service", "take a picture and write it to a file"),
         "record": ("record", "begin and end a recording; list, inspect, repair and replay them"),
-        "stop": ("stop", "stop the mast at once; with --without-daemon a head whose daemon is dead"),
-        "estop": ("stop", "stop the mast at once, and let nothing move it until 'mastctl reset'"),
+        "stop": ("stop", "stop the mast at once; --without-daemon if that is dead"),
+        "estop": ("stop", "stop the mast at once; nothing moves it until 'mastctl reset'"),
         "reset": ("stop", "release an emergency stop; nothing moves by that"),
     },
     "geometry, on files": {
@@ -50,16 +50,16 @@ OVERVIEW: Mapping[str, Mapping[str, tuple[str, str]]] = {
     },
     "calibration and acceptance": {
         "board": ("board", "a board to calibrate with: make one, measure it, find it"),
-        "calibrate": ("calibrate", "fit a mast file to a survey, or 'calibrate bench': to a board anywhere"),
+        "calibrate": ("calibrate", "fit a mast file to a survey; 'calibrate bench': to a board"),
         "calibrate bench": ("calibrate_bench", ""),
         "conform": ("conform", "accept a rig through its running daemon"),
     },
     "a rig of your own": {
         "rig": (
             "rig administration servos sim sentinel",
-            "write a rig's files; its machine, servos, lease, tokens, mast file and drift",
+            "write a rig's files; its servos, lease, tokens, mast file, drift",
         ),
-        "schema": ("rig", "print the JSON Schema of a file that people write; without NAME a list"),
+        "schema": ("rig", "print the JSON Schema of a file that people write"),
         "ros2": ("ros2", "a ROS 2 node of a running daemon, until Ctrl-C"),
     },
     "the paper's experiments": {
@@ -69,9 +69,14 @@ OVERVIEW: Mapping[str, Mapping[str, tuple[str, str]]] = {
 }
 """Headings of ``mastctl --help``; each command with the modules that bring it, and what it does."""
 
+EVERYWHERE = {
+    "COMMAND -h": "show the options of a command and an example",
+    "--url ADDRESS": "of a daemon; default: $MASTCTL_URL or that of --config",
+    "--json": "print one JSON document on stdout and nothing else",
+    "--version": "print the version",
+    "--print-completion SHELL": "for bash, zsh or tcsh",
+}
 COMMANDS = {words: entry for commands in OVERVIEW.values() for words, entry in commands.items()}
-
-_URL = "--url ADDRESS may stand before a command; default: $MASTCTL_URL, else the configuration's daemon"
 
 
 class _Overview(Parser):
@@ -83,12 +88,8 @@ class _Overview(Parser):
         for heading, commands in OVERVIEW.items():
             shown = ((words, help) for words, (_, help) in commands.items() if help)
             lines += [f"{heading}:", *(f"  {words:<12} {help}" for words, help in shown)]
-        options = {
-            "COMMAND -h": "show the options of a command and an example",
-            "--json": "print one JSON document",
-        }
-        options |= {"--version": "print the version", "--print-completion SHELL": "for bash, zsh or tcsh"}
-        return "\n".join([*lines, "", *(f"{name:<25} {help}" for name, help in options.items()), _URL, ""])
+        lines += ["", *(f"{name:<25} {help}" for name, help in EVERYWHERE.items()), ""]
+        return "\n".join(lines)
 
 
 class _Version(argparse.Action):

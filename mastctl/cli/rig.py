@@ -346,7 +346,7 @@ def _status(url: str) -> Status | None:
         return None
 
 
-@command("schema", option("[NAME]", "config, mast, board ..."), example="config")
+@command("schema", option("[NAME]", "config, mast, board ... (default: their list)"), example="config")
 def _schema(args: argparse.Namespace) -> Answer | int:
     from mastctl.packaged import schema_files
 
