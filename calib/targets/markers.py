@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.geometry.rigid import FloatArray, IntArray
 from calib.targets.board_file import FAMILIES
@@ -48,52 +47,22 @@ def predicted(known: MeasuredCorners, ids: IntArray, places_m: FloatArray) -> Me
     whose neighbours do not determine one.
     """
     count = min(16, len(known.points_m))
-    if not len(ids) or count < 4:
-        return MeasuredCorners(np.empty((0, 2)), np.empty((0, 2)))
-    away = np.linalg.norm(known.points_m - places_m[:, None], axis=2)
-    near = np.argpartition(away, count - 1, axis=1)[:, :count]
-    scale = np.maximum(np.take_along_axis(away, near, axis=1).max(axis=1), 1e-6)
-    points = (known.points_m[near] - places_m[:, None]) / scale[:, None, None]
-    middles = known.pixels_px[near].mean(axis=1)
-    pixels = known.pixels_px[near] - middles[:, None]
-    reach = np.maximum(np.abs(pixels).max(axis=(1, 2)), 1e-6)
-    H, determined = _homographies(points, pixels / reach[:, None, None])
-    at = H[:, :2, 2] * reach[:, None]
-    # of (H x) / (h x) at 0
-    jacobians = (reach / scale)[:, None, None] * (H[:, :2, :2] - H[:, :2, 2:] * H[:, 2:, :2])
-    kept = determined & np.isfinite(at).all(axis=1) & (np.linalg.det(jacobians) > 0.0)
-    return MeasuredCorners(np.empty((0, 2)), (at + middles)[kept], np.asarray(ids)[kept], jacobians[kept])
-
-
-def _homographies(points: FloatArray, pixels: FloatArray) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """Return homographies (n, 3, 3), lower right 1, of points (n, k, 2) to pixels, and which are determined.
-
-    Two rounds of least squares; what a point is divided by weighs its equation in the second.
-    """
-    n, k, _ = points.shape
-    ones, none = np.ones((n, k)), np.zeros((n, k, 3))
-    whole = np.dstack([points, ones])
-    rows = np.stack(
-        [
-            np.concatenate([whole, none, -pixels[..., :1] * points], axis=2),
-            np.concatenate([none, whole, -pixels[..., 1:] * points], axis=2),
-        ],
-        axis=2,
-    )
-    weights = ones
-    for _ in range(2):
-        weighted = rows * weights[..., None, None]
-        A = weighted.reshape(n, 2 * k, 8)
-        b = (pixels * weights[..., None]).reshape(n, 2 * k, 1)
-        normal = A.transpose(0, 2, 1) @ A
-        values = np.linalg.eigvalsh(normal)
-        determined = values[:, 0] > 1e-9 * values[:, -1]
-        normal[~determined] = np.eye(8)
-        h = np.linalg.solve(normal, A.transpose(0, 2, 1) @ b)[..., 0]
-        below = np.einsum("nki,ni->nk", points, h[:, 6:]) + 1.0
-        determined &= (below > 0.1).all(axis=1)
-        weights = 1.0 / np.maximum(below, 0.1)
-    return np.concatenate([h, np.ones((n, 1))], axis=1).reshape(n, 3, 3), determined
+    at, jacobians, kept = [np.empty((0, 2))], [np.empty((0, 2, 2))], []
+    for number, place in zip(ids, places_m, strict=True) if count >= 4 else ():
+        away = np.linalg.norm(known.points_m - place, axis=1)
+        near = np.argpartition(away, count - 1)[:count]
+        points = known.points_m[near] - place
+        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        H = homography(points, known.pixels_px[near]) if spread[1] > 1e-3 * spread[0] else None
+        if H is None or (points @ H[2, :2] + 1.0).min() < 0.1:
+            continue
+        jacobian = H[:2, :2] - np.outer(H[:2, 2], H[2, :2])  # of (H x) / (h x) at 0
+        if np.linalg.det(jacobian) > 0.0:
+            kept.append(number)
+            at.append(H[None, :2, 2])
+            jacobians.append(jacobian[None])
+    found = np.array(kept, dtype=np.int64)
+    return MeasuredCorners(np.empty((0, 2)), np.concatenate(at), found, np.concatenate(jacobians))
 
 
 MarkerBoard = Charuco | AprilGrid
