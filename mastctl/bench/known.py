@@ -43,37 +43,11 @@ BESIDE, BESIDE_AT_FIRST = 0.1, 0.5
 class BenchKnowledge:
     """What was seen, what follows from it, and the fit of it that is under way.
 
-    Parameters
-    ----------
-    head
-        As it is known before anything is seen.
-    kept
-        The survey's folder; what is in it already is known.
-    board_name, board
-        What is looked for.
-    fit
-        Makes a rig of the survey.
-    say
-        Is told what a fit refuses.
-
-    Attributes
-    ----------
-    now
-        The present estimate.
-    sought
-        What a shot has to show.
-    aim
-        What the rig is for.
-    workspace
-        Where it points.
-    looks
-        Placement, whether it is a check's, the look; in turn.
-    shots
-        What of them is fitted.
-    fitted
-        The last fit; None before the first.
-    fitted_looks
-        How many looks it knew.
+    ``kept`` is the survey's folder, whose looks are known already; ``fit`` makes a rig of the survey; ``say``
+    shows what a fit refuses. Of the estimate, ``now`` is the rig with the boards' places, ``sought`` what a
+    shot has to show, ``aim`` and ``workspace`` where the rig is to point. ``looks`` are placement, whether it
+    is the check's, and the look, in turn; ``shots`` what of them is fitted; ``fitted`` is the last fit, and
+    ``fitted_looks`` how many looks it knew.
     """
 
     def __init__(
@@ -112,8 +86,6 @@ class BenchKnowledge:
     def end(self) -> None:
         """Fit no more."""
         self._pool.shutdown(wait=False, cancel_futures=True)
-
-    # -- what follows ----------------------------------------------------------------------------------
 
     @property
     def counts_px(self) -> float:
@@ -157,14 +129,14 @@ class BenchKnowledge:
         )
 
     def round_others(self, name: str) -> Iterator[BenchShot]:
-        """Yield attitudes at which a placement's board is at the corners of the picture of each camera on the
-        head that does not point, apart from those that were taken: what tells most of pointing need not show
-        the board to a camera of a narrow view, and its own place in the head follows from such alone."""
+        """Yield attitudes that bring a placement's board to the image's corners of each head camera that
+        does not point, apart from those that were taken: what tells most of pointing need not show the board
+        to a narrow view, and that camera's own place in the head follows from such images alone."""
         board = self.now.boards[name].translation_m
-        for camera, held in self.now.rig.cameras.items():
-            if held.on != "head" or camera in self.workspace.cameras:
+        for camera, mounted in self.now.rig.cameras.items():
+            if mounted.on != "head" or camera in self.workspace.cameras:
                 continue
-            size, model = np.array(held.model.size_px), held.model
+            size, model = np.array(mounted.model.size_px), mounted.model
             apart = APART * size / (np.linalg.norm(model.H), np.linalg.norm(model.V))
             for place in CORNERS:
                 try:
@@ -179,18 +151,16 @@ class BenchKnowledge:
 
     def cells(self) -> dict[str, tuple[int, ...]]:
         """Return how many corners were seen in each of `CELLS` of each camera's picture, row by row."""
-        columns, rows = CELLS
         counts: dict[str, NDArray[np.int64]] = {}
         for _, check, look in self.looks:
             for one in () if check else look.found:
                 if one.corners is None or one.camera not in self.now.rig.cameras:
                     continue
-                per_px = np.array(CELLS) / self.now.rig.cameras[one.camera].model.size_px
-                at = np.floor((one.corners.pixels_px + 0.5) * per_px).astype(int)
-                x, y = np.clip(at, 0, [columns - 1, rows - 1]).T
-                camera = counts.setdefault(one.camera, np.zeros(columns * rows, dtype=np.int64))
-                np.add.at(camera, y * columns + x, 1)
-        return {camera: tuple(told.tolist()) for camera, told in counts.items()}
+                edges = [(-0.5, size - 0.5) for size in self.now.rig.cameras[one.camera].model.size_px]
+                x, y = np.clip(one.corners.pixels_px, *np.transpose(edges)).T
+                found, _, _ = np.histogram2d(y, x, bins=CELLS[::-1], range=edges[::-1])
+                counts[one.camera] = counts.get(one.camera, 0) + found.astype(np.int64).ravel()
+        return {camera: tuple(found.tolist()) for camera, found in counts.items()}
 
     def untied(self) -> list[str]:
         """Return the body cameras that have seen too few of the placements that the head saw."""
@@ -205,7 +175,7 @@ class BenchKnowledge:
 
     def promised_px(self, looks: Sequence[BenchLook], name: str) -> dict[str, float]:
         """Return what corners of looks that were not fitted should be off by, rms per axis, by camera."""
-        told: dict[str, list[float]] = {}
+        squares: dict[str, list[float]] = {}
         covariance = covariance_of(with_board(self.now, self.shots, name))
         for look in looks:
             shot = self._shot(name, look)
@@ -213,12 +183,9 @@ class BenchKnowledge:
                 rates = self.now.view_rates(shot, view)
                 by_rig = np.einsum("nip,pq,niq->ni", rates[..., :-2], covariance, rates[..., :-2])
                 by_joints = self.now.joint_sigma_rad**2 * (rates[..., -2:] ** 2).sum(axis=2)
-                told.setdefault(view.camera, []).append(
-                    float(np.mean(by_rig + by_joints)) + self.sought.sigma_px**2
-                )
-        return {camera: math.sqrt(np.mean(values)) for camera, values in told.items()}
-
-    # -- what is learned -------------------------------------------------------------------------------
+                square = float(np.mean(by_rig + by_joints)) + self.sought.sigma_px**2
+                squares.setdefault(view.camera, []).append(square)
+        return {camera: math.sqrt(np.mean(values)) for camera, values in squares.items()}
 
     def take(self, name: str, look: BenchLook, check: bool = False) -> None:
         """Keep a look at a placement, add it to what is known, and fit beside what comes next if it is

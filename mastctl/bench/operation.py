@@ -38,7 +38,7 @@ from mastctl.bench.runs import (
 )
 from mastctl.control.caller import Caller
 from mastctl.control.lease import Lease, LeaseTable, StopCame
-from mastctl.control.publisher import Published, Publisher, ThreadSubscription
+from mastctl.control.publisher import Publisher, ThreadSubscription
 from mastctl.errors import BadRequest, MastctlError, NotNow, Unable
 
 log = logging.getLogger(__name__)
@@ -67,6 +67,7 @@ class _Work:
     """A run that is at work, or was."""
 
     folder: RunFiles
+    request: dict[str, Any]
     lease: Lease
     revoke_token: Callable[[], None]
     run: BenchRunRecord
@@ -80,8 +81,6 @@ class BenchOperation:
 
     Parameters
     ----------
-    state
-        The daemon's state folder.
     masts_folder
         Returns the folder of the daemon's mast files.
     leases, publisher
@@ -89,8 +88,6 @@ class BenchOperation:
         stops are read.
     simulated
         Whether the rover is: only there the board may go where it is requested by itself.
-    work
-        What the worker process does.
     """
 
     def __init__(
@@ -263,16 +260,13 @@ class BenchOperation:
         if resume is not None:
             folder = self.runs.named(resume)
             try:
-                before, end = folder.request(), folder.end()
+                before = folder.read()
                 before |= {"begun": str(before["begun"]), "mast_file": str(before["mast_file"])}
-            except BadFile as error:
-                raise BadRequest("bad_run", str(error)) from None
-            except KeyError as error:
-                place = folder.path / "run.json"
-                raise BadRequest(
-                    "bad_run", f"{place}: {error.args[0]} is missing; begin another run"
-                ) from None
-            if end is not None and end.get("state") == "done":
+            except (BadFile, KeyError) as error:
+                missing = f"{error} is missing in {folder.path}; begin another run"
+                reason = str(error) if isinstance(error, BadFile) else missing
+                raise BadRequest("bad_run", reason) from None
+            if (before.pop("end", None) or {}).get("state") == "done":
                 raise NotNow("bench_done", f"run {folder.name} has its verdict; begin another")
         else:
             data, described = board_bytes(board, board_file)
@@ -289,9 +283,8 @@ class BenchOperation:
         request = {**usual, **before, **{key: one for key, one in now.items() if one is not None}, "by": by}
         request["by_hand"] = request["by_hand"] or not self._simulated
         try:
-            folder.save_request(request)
-            (folder.path / "end.json").unlink(missing_ok=True)
-        except (BadFile, OSError) as error:
+            folder.write(request)
+        except BadFile as error:
             raise Unable("unwritable", str(error)) from None
         return folder, request
 
@@ -307,7 +300,7 @@ class BenchOperation:
         context = get_context("spawn")  # a fork would copy the daemon's threads half
         ours, its = context.Pipe()
         process = context.Process(target=self.work, args=(job, its), name=HOLDER, daemon=True)
-        work = self._work = _Work(folder, lease, revoke_token, run, process, ours)
+        work = self._work = _Work(folder, request, lease, revoke_token, run, process, ours)
         try:
             process.start()
             its.close()
@@ -334,11 +327,8 @@ class BenchOperation:
                         work.process.join(ENDS_S)  # published afterwards: the next client may steer then
                         return self._end(work, run["state"], run["code"], run["sentence"], run)
                     self._change(work, run)
-                stopped = next(filter(None, map(_stop_in, commands.wait(0.0))), None)
-                if stopped is None and self._leases.was_stopped(work.lease):
-                    stopped = _stop_of(commands)
-                if stopped is not None:
-                    return self._end(work, "interrupted", "stopped", f"{stopped}, {GOES_ON}")
+                if self._leases.was_stopped(work.lease):
+                    return self._end(work, "interrupted", "stopped", f"{_stop_of(commands)}, {GOES_ON}")
                 try:
                     if time.monotonic() >= renew_s or not self._leases.holds(work.lease.id):
                         self._leases.renew(work.lease.id, LEASE_S)
@@ -353,7 +343,7 @@ class BenchOperation:
         code = work.process.exitcode
         how = f"ended with exit code {code}"
         if code is not None and code < 0:
-            how = f"was ended by {_signal(-code)}"
+            how = f"was ended by signal {-code} ({signal.strsignal(-code)})"
         self._end(work, "interrupted", "program_ended", f"the calibration program {how}; {GOES_ON}")
 
     def _change(self, work: _Work, run: BenchRunRecord) -> None:
@@ -392,12 +382,12 @@ class BenchOperation:
         said = [*work.run["sentences"], sentence] if run is None else run["sentences"]
         last = {"state": state, "step": "over", "code": code, "sentence": sentence, "sentences": said}
         if state == "done":
-            last["mast_file"] = f"bench-{work.folder.name}.yaml"
+            last["mast_file"] = work.request["mast_file"]
         if work.folder.page.is_file():
             last["report"] = work.folder.name
         run = cast(BenchRunRecord, {**(run or work.run), **last})
         try:
-            work.folder.save_end(run)
+            work.folder.write(work.request, run)
         except BadFile as error:
             log.error("how the bench calibration ended is not kept: %s", error)
         work.run = run
@@ -409,22 +399,16 @@ class BenchOperation:
             self._publisher.publish("bench", "run", work.run)
 
 
-def _stop_in(one: Published) -> str | None:
-    """Return the sentence of a stop, if that is what was published: its client and whether it worked."""
-    if one.value.get("command") not in ("stop", "estop") or "ended" in one.value:
-        return None
-    what = "stop" if one.value["command"] == "stop" else "the emergency stop"
-    stands = "the head stands still" if one.value.get("result") == "ok" else "the head did not confirm it"
-    return f"{one.value.get('who', 'a client')} pressed {what}; {stands}"
-
-
 def _stop_of(commands: ThreadSubscription) -> str:
     """Return the sentence of the stop that has ended the lease: its record follows the head's answer."""
     until_s = time.monotonic() + STOP_KNOWN_S
     while (left_s := until_s - time.monotonic()) > 0.0 and not commands.closed:
-        stopped = next(filter(None, map(_stop_in, commands.wait(left_s))), None)
-        if stopped is not None:
-            return stopped
+        for record in (one.value for one in commands.wait(left_s)):
+            if record.get("command") in ("stop", "estop") and "ended" not in record:
+                stop = "stop" if record["command"] == "stop" else "the emergency stop"
+                still = record.get("result") == "ok"
+                head = "the head stands still" if still else "the head did not confirm it"
+                return f"{record.get('who', 'a client')} pressed {stop}; {head}"
     return "a stop was requested"
 
 
@@ -443,10 +427,3 @@ def _check_space(masts: Path, state: Path) -> None:
     if free < FREE_BYTES:
         sentence = f"{free / 1e6:.0f} MB are free in {state} where {FREE_BYTES / 1e6:.0f} are needed"
         raise Unable("disk_low", sentence)
-
-
-def _signal(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"

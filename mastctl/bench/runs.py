@@ -1,10 +1,10 @@
 """The folders of runs, below ``bench`` in the daemon's state folder: request, pictures and result.
 
-20261122-184501/run.json       the request: its client and time, what is wanted, the mast file to make
+20261122-184501/run.json       the request (client, time, what is wanted, the mast file to make) and, under
+                               ``end``, how it ended; without it it was cut off
                 board.yaml     the board
                 seen/          the survey, and the run's journal
                 report/        bench.html
-                end.json       how it ended; not there: it was cut off
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mastctl.packaged import config_folder
 from mastctl.safety.state_file import StateFile
 
 NAME = re.compile(r"[0-9]{8}-[0-9]{6}(-[0-9]{1,3})?")
-SCHEMA, END_SCHEMA = "mastctl/guided/1", "mastctl/guided_end/1"
+SCHEMA = "mastctl/bench_run/1"
 SHOWN = 50
 MOST_BOARD_BYTES = 100_000
 
@@ -95,38 +95,33 @@ class RunFiles:
         """The report."""
         return self.report / "bench.html"
 
-    def request(self) -> dict[str, Any]:
-        """Return what was requested. Raises BadFile."""
-        request = StateFile(self.path / "run.json", SCHEMA).read()
-        if request is None:
+    def read(self) -> dict[str, Any]:
+        """Return run.json. Raises BadFile."""
+        document = StateFile(self.path / "run.json", SCHEMA).read()
+        if document is None:
             raise BadFile(self.path / "run.json", "", "is missing: this is no run's folder")
-        return request
+        return document
 
-    def end(self) -> dict[str, Any] | None:
-        """Return how it ended, None if it was cut off. Raises BadFile."""
-        return StateFile(self.path / "end.json", END_SCHEMA).read()
-
-    def save_request(self, request: Mapping[str, Any]) -> None:
-        """Write down what is requested. Raises BadFile."""
-        StateFile(self.path / "run.json", SCHEMA).write(request)
-
-    def save_end(self, run: BenchRunRecord) -> None:
-        """Write down how it ended. Raises BadFile."""
-        end = {
-            **{key: run[key] for key in ("state", "code", "sentence", "pictures")},
-            "grade": None if run["result"] is None else run["result"]["verdict"]["grade"],
-            "ended": datetime.now(UTC).isoformat(timespec="seconds"),
-        }
-        StateFile(self.path / "end.json", END_SCHEMA).write(end)
+    def write(self, request: Mapping[str, Any], ended: BenchRunRecord | None = None) -> None:
+        """Write run.json: what is requested, and how the run has ended. Raises BadFile."""
+        document = dict(request)
+        if ended is not None:
+            grade = None if ended["result"] is None else ended["result"]["verdict"]["grade"]
+            at = datetime.now(UTC).isoformat(timespec="seconds")
+            document["end"] = {
+                **{key: ended[key] for key in ("state", "code", "sentence")}, "grade": grade, "at": at,
+            }  # fmt: skip
+        StateFile(self.path / "run.json", SCHEMA).write(document)
 
     def summary(self) -> BenchSummary:
         """Return the run as the list of runs has it; of a damaged one that it is."""
         empty = {"begun": "", "by": "", "board": "", "grade": None, "mast_file": None, "report": None}
         found: dict[str, Any] = {"name": self.name, "pictures": 0, "size_mb": 0.0, **empty}
         try:
-            request, end = self.request(), self.end() or {}
+            request = self.read()
         except BadFile as error:
             return cast(BenchSummary, {**found, "state": "damaged", "sentence": str(error)})
+        end = request.get("end") or {}
         state = str(end.get("state", "interrupted"))
         cut = "it was cut off: the daemon or its machine ended meanwhile"
         sizes = _image_sizes(self.seen)

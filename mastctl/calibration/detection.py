@@ -36,14 +36,8 @@ def with_dots(
 ) -> tuple[Survey, tuple[tuple[str, str], ...]]:
     """Return the survey with the dots of every image that shows them, and (image, reason) of the others.
 
-    Parameters
-    ----------
-    survey
-        As read; not changed.
-    progress
-        Called after each image: how many are done, of how many, and its name.
-    executor
-        Where images are searched; by default one process for each processor.
+    ``progress`` is called after each image: how many are done, of how many, and its name. Images are searched
+    by ``executor``; by default one process for each processor.
 
     Raises
     ------

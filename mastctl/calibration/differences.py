@@ -6,31 +6,25 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.parameters import predict
 from calib.geometry.rig import Rig
-from calib.geometry.rigid import FloatArray, Rigid, moved_rigid, rigid_rates
+from calib.geometry.rigid import FloatArray, Rigid, moved_rigid
 
 GRID = (13, 10)
 RANGES_M = (2.0, 20.0)
-STEPS = 20
 
 
 @dataclass(frozen=True, eq=False)
 class Difference:
     """One camera against its former model, both in the frame that they are mounted on.
 
-    Attributes
-    ----------
-    camera, size_px
-        Which, and its picture's size.
-    pixels_px
-        (n, 2) where it is compared.
-    lens_px
-        (n, 2) new less former pixel of what the former saw there, far away, the motion taken out.
-    turned_rad, shifted_m
-        (3,) the motion that makes the former camera project as the new one does, as well as one can.
+    ``pixels_px`` (n, 2): where it is compared. ``lens_px`` (n, 2): new less former pixel of what the former
+    saw there, far away, the motion taken out. ``turned_rad``, ``shifted_m`` (3,): the motion that makes the
+    former camera project as the new one does, as well as one can.
     """
 
     camera: str
@@ -66,53 +60,36 @@ def rig_differences(new: Rig, former: Rig) -> Iterator[Difference]:
     """Yield the difference of each camera that both rigs have, of the same size and mount."""
     for name, camera in new.cameras.items():
         old = former.cameras.get(name)
-        if old is not None and old.on == camera.on and old.model.size_px == camera.model.size_px:
-            yield camera_difference(name, camera.model, old.model)
-
-
-def camera_difference(name: str, new: CameraModel, former: CameraModel) -> Difference:
-    """Return how far a camera is from its former model."""
-    moved, _ = implied_motion([(new, former)])
-    pixels, far = _what_it_saw(former, RANGES_M[-1:])
-    seen, valid = new.project(moved.points(far))
-    lens = np.where(valid[:, None], seen, np.nan) - pixels
-    motion = moved.inverse  # points moved into the camera's place: the camera moved the other way
-    return Difference(name, former.size_px, pixels, lens, -_rotvec(moved.rotation), motion.translation_m)
+        if old is None or old.on != camera.on or old.model.size_px != camera.model.size_px:
+            continue
+        moved, _ = implied_motion([(camera.model, old.model)])
+        pixels, far = _what_it_saw(old.model, RANGES_M[-1:])
+        seen, valid = camera.model.project(moved.points(far))
+        lens = np.where(valid[:, None], seen, np.nan) - pixels
+        motion = moved.inverse  # points moved into the camera's place: the camera moved the other way
+        turned = -Rotation.from_matrix(moved.rotation).as_rotvec()
+        yield Difference(name, old.model.size_px, pixels, lens, turned, motion.translation_m)
 
 
 def implied_motion(pairs: Sequence[tuple[CameraModel, CameraModel]]) -> tuple[Rigid, float]:
     """Return the motion of points after which new cameras see them as the former ones saw them before.
 
-    Parameters
-    ----------
-    pairs
-        New and former models; all of the new ones in one frame, all of the former in another.
-
-    Returns
-    -------
-    new_from_former
-        The motion, least squares over all pictures.
-    rms_px
-        What is left of pixels, rms per axis.
+    By least squares over all images, with the rms per axis that is left, px. ``pairs`` are new and former
+    models; all of the new ones in one frame, all of the former in another.
     """
     new, former = pairs[0]
-    axes, old = new.axes, former.axes
-    moved = Rigid(axes @ old.T, new.C - axes @ old.T @ former.C)
-    for _ in range(STEPS):
-        rates, off = [], []
-        for new, former in pairs:
-            pixels, points = _what_it_saw(former, RANGES_M)
-            here = moved.points(points)
-            seen = predict(new, here)
-            off.append((seen.pixels_px - pixels).ravel())
-            rates.append(rigid_rates(seen.d_points, here, moved.translation_m).reshape(-1, 6))
-        residual, jacobian = np.concatenate(off), np.concatenate(rates)
-        good = np.isfinite(residual) & np.isfinite(jacobian).all(axis=1)
-        step = -np.asarray(np.linalg.lstsq(jacobian[good], residual[good], rcond=None)[0], dtype=np.float64)
-        moved = moved_rigid(moved, step)
-        if np.linalg.norm(step) < 1e-12:
-            break
-    return moved, float(np.sqrt(np.mean(residual[good] ** 2)))
+    turn = new.axes @ former.axes.T
+    start = Rigid(turn, new.C - turn @ former.C)
+    seen = [(one, *_what_it_saw(old, RANGES_M)) for one, old in pairs]
+
+    def off_px(step: FloatArray) -> FloatArray:
+        moved = moved_rigid(start, step)
+        off = [predict(one, moved.points(points)).pixels_px - pixels for one, pixels, points in seen]
+        return np.nan_to_num(np.concatenate(off).ravel(), posinf=0.0, neginf=0.0)
+
+    found = least_squares(off_px, np.zeros(6), xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    both = found.fun != 0.0  # where both see
+    return moved_rigid(start, found.x), float(np.sqrt(np.mean(found.fun[both] ** 2))) if both.any() else 0.0
 
 
 def _what_it_saw(camera: CameraModel, ranges_m: Sequence[float]) -> tuple[FloatArray, FloatArray]:
@@ -126,9 +103,3 @@ def _what_it_saw(camera: CameraModel, ranges_m: Sequence[float]) -> tuple[FloatA
     rays = camera.ray(pixels)
     points = [rays.origins_m + range_m * rays.directions for range_m in ranges_m]
     return np.concatenate([pixels] * len(ranges_m)), np.concatenate(points)
-
-
-def _rotvec(rotation: FloatArray) -> FloatArray:
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_matrix(rotation).as_rotvec())

@@ -75,16 +75,7 @@ def pointing_error_px(
 ) -> FloatArray:
     """Return how far (2,), pixels, a target lands from the middle of the left image after one pointing.
 
-    Parameters
-    ----------
-    believed, true
-        The rig that computes, and the rig that moves.
-    pan_rad, tilt_rad
-        Joint angles at which the target was clicked.
-    target_m
-        Where the target is, rover frame (3,).
-    left_px, right_px
-        The clicks (2,).
+    The target (3,), rover frame, was clicked in both images (2,) at the given joint angles.
 
     Raises
     ------

@@ -117,16 +117,9 @@ def with_correction(
 ) -> Rig:
     """Return a corrected rig with ``fit`` and ``provenance`` that say by what it was corrected.
 
-    What else the former file has under ``fit`` stays as its survey left it.
-
-    Parameters
-    ----------
-    mast, rig
-        The file that was corrected, and the corrected rig.
-    known
-        The corrected rig's covariance; None where the former file has none.
-    corrected, by
-        What stands under ``fit`` besides, and in the provenance's list of corrections.
+    What else the former file has under ``fit`` stays as its survey left it. ``known`` is the corrected rig's
+    covariance, None where the former file has none; ``corrected`` comes under ``fit``, ``by`` into the
+    provenance's list of corrections.
     """
     fit = {**mast.rig.fit, **corrected}
     if known is not None:

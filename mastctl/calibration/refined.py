@@ -34,20 +34,9 @@ SHIFT_FIRST = (3, 4, 5, 0, 1, 2)
 class Proposal:
     """What records of hand-offs say of a mast file.
 
-    Attributes
-    ----------
-    mast, logs
-        What was read.
-    handoffs
-        Those of this very mast file; each is looked at once, in however many records it stands.
-    other_mast
-        How many were made with another mast file and were passed over.
-    bias
-        Mean offset by camera.
-    poses
-        By body pair: the correction, significant or not.
-    refusals
-        By body pair without one: why.
+    ``handoffs`` are those of this very mast file, each once; ``other_mast`` counts those that were made with
+    another one. ``bias``: mean offset by camera. ``poses``, ``refusals``: by body pair the correction,
+    significant or not, or why there is none.
     """
 
     mast: StoredRig

@@ -73,19 +73,10 @@ def calibrate(
     warnings: tuple[SurveyFinding, ...] = (),
     undetected: tuple[tuple[str, str], ...] = (),
 ) -> Calibrated:
-    """Fit a checked survey, judge the result, and save it as a mast file.
+    """Fit a checked survey with its dots, judge the result, and save it as a mast file.
 
-    Parameters
-    ----------
-    survey
-        With dots for every image that shall be fitted.
-    out
-        The mast file. The version before it is kept as ``NAME.previous.yaml``, and what had that name as
-        ``NAME.previous-1.yaml`` and so on: none is lost.
-    method, mast_parameters
-        ``paper`` or ``joint``; 4, 6 or 8.
-    warnings, undetected
-        From the check and from the search for dots, for the verdict.
+    Every former version of ``out`` is kept, the last as ``NAME.previous.yaml``. ``warnings`` and
+    ``undetected``, from the check and from the search for dots, are for the verdict.
 
     Raises
     ------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 from typing import Any
@@ -74,7 +75,7 @@ def test_the_worker_gets_lease_and_token_but_not_on_its_command_line(tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("end", "how"), [(killed, "was ended by SIGKILL"), (gives_up, "ended with exit code 7")]
+    ("end", "how"), [(killed, "was ended by signal 9 (Killed)"), (gives_up, "ended with exit code 7")]
 )
 def test_a_worker_that_dies_is_reported_and_frees_the_lease(tmp_path: Path, end: Step, how: str) -> None:
     with world(tmp_path, script(BEGUN, end)) as made:
@@ -107,6 +108,7 @@ def test_a_stop_while_the_board_is_placed_ends_the_run_too(tmp_path: Path) -> No
     with world(tmp_path, script(BEGUN, PLACE, answered)) as made:
         made.begin()
         made.until("asking")
+        made.leases.stop_came()
         made.publisher.publish("command", "1", stop_pressed("estop"))
         assert "the emergency stop; the head stands still" in made.until("interrupted")["sentence"]
         with pytest.raises(NotNow, match="no bench calibration is at work"):
@@ -162,9 +164,10 @@ def test_a_run_that_was_cut_off_with_its_daemon_is_listed_and_goes_on(tmp_path: 
     with world(tmp_path, script(BEGUN, PLACE, answered)) as made:
         name = made.begin()["name"]
         made.until("asking")
-    end = tmp_path / "state" / "bench" / name / "end.json"
-    assert "the daemon ended" in end.read_text()
-    end.unlink()
+    file = tmp_path / "state" / "bench" / name / "run.json"
+    document = json.loads(file.read_text())
+    assert "the daemon ended" in document.pop("end")["sentence"]
+    file.write_text(json.dumps(document))
     with world(tmp_path, script(BEGUN, DONE)) as made:
         (listed,) = made.bench.answer()["runs"]
         assert listed["state"] == "interrupted" and "cut off" in listed["sentence"]
