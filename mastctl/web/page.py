@@ -102,24 +102,21 @@ def add_page(app: FastAPI) -> None:
     async def page(request: Request) -> Response:
         return text_answer(request.headers, first, KINDS["html"])
 
-    for name, data in known.items():
-        for place, keep in ((f"/page/{version}/{name}", FOR_GOOD), (f"/page/{name}", ASK_AGAIN)):
-            give = _giver(data, KINDS[name.rpartition(".")[2]], keep)
-            app.add_api_route(place, give, methods=["GET"], include_in_schema=False)
+    @app.get("/page/{name:path}", include_in_schema=False)
+    async def file(name: str, request: Request) -> Response:
+        keep = ASK_AGAIN
+        if name.startswith(f"{version}/"):
+            name, keep = name.removeprefix(f"{version}/"), FOR_GOOD
+        if name not in known:
+            raise HTTPException(404)
+        return text_answer(request.headers, known[name], KINDS[name.rpartition(".")[2]], keep)
 
     @app.get(f"{PREFIX}/rig", summary="The configured cameras by the mast file in use")
     async def rig(here: Here) -> RigSummary:
-        return await here.waiting.run(lambda: rig_told(here.service))
+        return await here.waiting.run(lambda: rig_summary(here.service))
 
 
-def _giver(data: bytes, kind: str, keep: str) -> Any:
-    async def give(request: Request) -> Response:
-        return text_answer(request.headers, data, kind, keep)
-
-    return give
-
-
-def rig_told(service: Service) -> RigSummary:
+def rig_summary(service: Service) -> RigSummary:
     """Return what of the rig is drawn. Reads the folder of the mast file."""
     stored = service.stored
     names = service.config.hardware.cameras
@@ -175,10 +172,8 @@ def _between(one: np.ndarray, other: np.ndarray) -> float:
 def _partners(name: str, stereo: Stereo) -> tuple[str | None, Literal["left", "right"] | None, str | None]:
     """The pair of a camera, which side of it, and the other one."""
     for pair, (left, right) in stereo.items():
-        if name == left:
-            return pair, "left", right
-        if name == right:
-            return pair, "right", left
+        if name in (left, right):
+            return pair, "left" if name == left else "right", right if name == left else left
     return None, None, None
 
 
