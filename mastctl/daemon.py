@@ -344,7 +344,7 @@ async def _report_state(service: Service, manager: ServiceManager) -> None:
         while not changes.closed:
             for change in await changes.wait():
                 now = change.value
-                manager.status(f"{now.word}: {now.reason}" if now.reason else now.word)
+                manager.status(f"{now.state}: {now.reason}" if now.reason else now.state)
 
 
 def _settings(app: ASGIApp) -> uvicorn.Config:

@@ -17,10 +17,9 @@ import calib
 from calib.errors import CalibError
 from drivers import faults
 from drivers.errors import DriverError
-from mastctl.answers import Word
 from mastctl.cli.main import build_parser
 from mastctl.conform.rig_checks import RIG
-from mastctl.control.table import CHOICES, EVENTS, HAPPENS, MEANINGS, TABLE, WORDS, Event
+from mastctl.control.standing import MEANINGS
 from mastctl.errors import MastctlError
 from mastctl.testing.drivers import test_camera, test_head
 from mastctl.web.app import api
@@ -260,35 +259,12 @@ def _errors(*bases: Any) -> Iterator[Any]:
 
 
 def states_page() -> str:
-    """Return the states of the daemon, the events and the transitions."""
-    intro = "Written from the daemon's table; [How a stop is built](../../explanation/safety.md) explains it."
-    lines = ["# States and events", "", intro, "", "| state | meaning |", "| --- | --- |"]
-    lines += [f"| `{word}` | {MEANINGS[word]} |" for word in WORDS]
-    lines += ["", "| event | what happened | leads to |", "| --- | --- | --- |"]
-    lines += [f"| `{event}` | {HAPPENS[event]} | {_leads_to(event)} |" for event in EVENTS]
-    lines += ["", "| choice | the first that is true |", "| --- | --- |"]
-    for choice, (follows, words) in CHOICES.items():
-        summary = (follows.__doc__ or "").partition("\n")[0].removeprefix("Return the state ").rstrip(".")
-        lines.append(f"| *{choice}* | {', '.join(f'`{word}`' for word in words)}: {summary} |")
+    """Return the states of the daemon, in the order in which they count."""
+    explained = "[How a stop is built](../../explanation/safety.md) explains them."
+    intro = f"Of several that are true the first counts; {explained}"
+    lines = ["# States", "", intro, "", "| state | meaning |", "| --- | --- |"]
+    lines += [f"| `{state}` | {meaning} |" for state, meaning in MEANINGS.items()]
     return "\n".join([*lines, ""])
-
-
-def _leads_to(event: Event) -> str:
-    """The states that an event leads to, those with the same answer together."""
-    froms: dict[str, list[Word]] = {}
-    for word in WORDS:
-        if (to := TABLE[word].get(event)) is not None:
-            froms.setdefault(to, []).append(word)
-    answers = []
-    for answer, words in froms.items():
-        states = "every state" if len(words) == len(WORDS) else ", ".join(f"`{word}`" for word in words)
-        refusal, shown = (
-            answer.removeprefix("refused: "),
-            f"*{answer}*" if answer in CHOICES else f"`{answer}`",
-        )
-        name = f"refused with `{refusal}`" if refusal != answer else shown
-        answers.append(f"{name} from {states}")
-    return "; ".join(answers)
 
 
 def fault_words_page() -> str:

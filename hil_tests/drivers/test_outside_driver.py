@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,8 +21,9 @@ from drivers.registry import installed_drivers
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
 from mastctl.motion.loop import PointingLoop
-from mastctl.motion.requests import AnglesTarget, PixelTarget, PointRequest
-from mastctl.motion.results import Step
+from mastctl.motion.requests import PixelTarget, PointRequest
+from mastctl.motion.results import PointingResult, Step
+from mastctl.motion.settings import PointingSettings
 from mastctl.setup.machine import examine_drivers
 
 LANDED_WITHIN_PX = 0.6
@@ -51,14 +53,19 @@ def test_the_pointing_loop_runs_on_it(hardware: Hardware, mast_file: Path) -> No
     limits = Limits((-2.0, 2.0), (-1.2, 0.5), 1.5)
     clock = SystemClock()
     devices = Devices(hardware, limits, stored.digest, clock, stored.rig)
-    loop = PointingLoop(stored.rig, devices, limits, clock)
     steps: list[Step] = []
+
+    def point(**target: Any) -> PointingResult:
+        settings, stopped = PointingSettings(), threading.Event()
+        loop = PointingLoop(stored.rig, devices, limits, clock, settings, steps.append, stopped)
+        return loop.run(PointRequest(**target))
+
     try:
-        loop.run(PointRequest(AnglesTarget(-0.3, -0.5)), steps.append, threading.Event())
+        point(pan_rad=-0.3, tilt_rad=-0.5)
         clicked = devices.frames(["navcam_left"], clock.now_s(), 5.0)["navcam_left"]
         spot_px = (600, 330)
         target = PixelTarget("navcam_left", clicked.frame_id, *spot_px)
-        result = loop.run(PointRequest(target, pointings=2), steps.append, threading.Event())
+        result = point(pixel=target, pointings=2)
         after = devices.frame_by_id(result.pointings[-1].frame_id)
     finally:
         devices.close()

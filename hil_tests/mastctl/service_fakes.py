@@ -224,9 +224,10 @@ class ScriptedLoop:
 
     def __init__(self, rig: Rig, devices: Any, *others: Any) -> None:
         self._devices = devices
+        *_, self._record, self._cancelled = others
 
-    def run(self, request: Any, record: Callable[[Any], None], cancelled: threading.Event) -> Any:
-        return type(self).script(request, record, cancelled, self._devices)
+    def run(self, request: Any) -> Any:
+        return type(self).script(request, self._record, self._cancelled, self._devices)
 
     @staticmethod
     def good(request: Any, record: Callable[[Any], None], cancelled: threading.Event, devices: Any) -> Any:

@@ -168,17 +168,17 @@ def test_a_part_that_cannot_be_closed_keeps_no_other_open(
 ) -> None:
     with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware):
         service, closed = daemon.service, list[str]()
-        named = ("guide", "metrics", "stop_threads", "recorder", "audit", "latch", "folder")
+        named = ("bench", "metrics", "stop_threads", "recorder", "audit", "latch", "folder")
         for name in named:
             part = getattr(service, name)
 
             def close(name: str = name, close: Any = part.close) -> None:
                 closed.append(name)
                 close()
-                if name in ("guide", "recorder"):
+                if name in ("bench", "recorder"):
                     raise RuntimeError(f"a defect of {name}")
 
             monkeypatch.setattr(part, "close", close)
         daemon.close()
         assert closed == list(named) and hardware.closed
-    assert "a defect of guide" in caplog.text and "a defect of recorder" in caplog.text
+    assert "a defect of bench" in caplog.text and "a defect of recorder" in caplog.text

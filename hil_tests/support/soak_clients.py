@@ -304,17 +304,20 @@ def _jog(client: SoakClient) -> None:
         "tilt_rad_per_s": client.draw.uniform(-0.3, 0.3),
     }
     jog: str | None = None
+    number = 0
     until_s = time.monotonic() + JOG_S
     while time.monotonic() < until_s:
+        number += 1
         named = {} if jog is None else {"id": jog}
-        told = client.ask("POST", "/jog", {**rates, **named}, headers)
+        told = client.ask("POST", "/jog", {**rates, **named, "sequence": number}, headers)
         if told["http"] >= 400:
             break
         jog = told["id"]
         time.sleep(0.1)
     if jog is not None:
         if client.draw.random() < 0.5:
-            client.ask("POST", "/jog", {"pan_rad_per_s": 0.0, "tilt_rad_per_s": 0.0, "id": jog}, headers)
+            still = {"pan_rad_per_s": 0.0, "tilt_rad_per_s": 0.0, "id": jog, "sequence": number + 1}
+            client.ask("POST", "/jog", still, headers)
         client.wait("jog", jog, 10.0)
     client.ask("DELETE", "/lease", None, headers)
 

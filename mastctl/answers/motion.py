@@ -108,7 +108,12 @@ class RefusedTold(TypedDict):
 
 
 class PreviewTold(TypedDict):
-    """``POST /point/preview``: what a clicked pixel shows, before anything moves."""
+    """``POST /point/preview``: what a clicked pixel shows in a fresh frame, before anything moves.
+
+    ``other_...``, the match's figures, ``sigma_m`` and ``range_sigma_m`` (one sigma, of the clicks and not of
+    the mast file) are null where one camera points alone; ``range_interval_m`` where a pair does.
+    ``goal_rad`` is null where no move leads there, ``refused`` where the head would be sent.
+    """
 
     camera: str
     frame_id: str

@@ -90,7 +90,7 @@ def _by_any_path(
 ) -> Mapping[str, Any]:
     """Stop by the stop socket where there is one, else over HTTP; ``reached``: the socket or address."""
     from mastctl.safety.stop_line import NoAnswer
-    from mastctl.safety.stop_line import ask as ask_socket
+    from mastctl.safety.stop_line import request as ask_socket
 
     answer: Mapping[str, Any] | None = None
     failed = ""

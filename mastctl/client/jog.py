@@ -95,7 +95,7 @@ class Jog:
         self._id, self._held = answer["id"], answer["held"]
         if rates == (0.0, 0.0) and self._id is not None:
             self._wait_ended(self._id)
-            self._id = None
+            self._id, self._sequence = None, 0
 
     def _wait_ended(self, jog: str) -> None:
         """Wait for the jog's end, so that the next command is not refused for it."""

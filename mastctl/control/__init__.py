@@ -1,1 +1,1 @@
-"""What a daemon does, and who may have it do what: its state, operations, commands, leases."""
+"""What a daemon does, and which client may have it do that: its state, operations, commands, leases."""

@@ -1,4 +1,4 @@
-"""The client of a request: its name, its rights, and the way it came."""
+"""The client of a request: its name, its rights, and how it came."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Caller:
     name
         As given by the client, for people and for the record; it proves nothing.
     role
-        Its rights. On the way that needs no token every client is ``admin``.
+        Its rights. On the path that needs no token every client is ``admin``.
     via
-        The way it came: ``loopback``, ``unix``, ``token``, ``inside`` (this process itself), ``network``
-        (a stranger without a valid token).
+        ``loopback``, ``unix``, ``token``, ``inside`` (this process itself), ``network`` (a stranger without a
+        valid token).
     address
         The address it came from; empty from inside.
     credential

@@ -23,8 +23,8 @@ from mastctl.control.audit import AuditLog
 from mastctl.control.caller import ANONYMOUS, NETWORK, Caller
 from mastctl.control.idempotency import Answer, Answers
 from mastctl.control.lease import LeaseTable, StopCame
+from mastctl.control.machine import Need
 from mastctl.control.publisher import Publisher
-from mastctl.control.refusals import Need
 from mastctl.errors import BadRequest, MastctlError, NotNow, Stopped, error_body
 
 LONGEST_DEADLINE_S = 3600.0
@@ -77,7 +77,7 @@ SUN = Command("limits.sun")  # a fact too
 SUN_FORGET = Command("limits.sun.forget")
 STOP = Command("stop", "view")
 ESTOP = Command("estop", "view")
-OPERATION_STOP = Command("operation.stop")  # of that one only: the client that steers by now is not disturbed
+OPERATION_STOP = Command("operation.stop")  # of that one only: the client that steers by now is left alone
 RESET = Command("reset", need="latch")
 RECORD_START = Command("record.start")
 RECORD_STOP = Command("record.stop")
@@ -106,25 +106,21 @@ class CommandRequest:
 
     Attributes
     ----------
-    caller
-        The client.
+    came_s
+        When it came, by the daemon's clock; needed for a deadline only.
     request
         The request itself, as JSON.
-    lease
-        The lease's id that came with it.
-    key
-        The idempotency key that came with it.
+    lease, key
+        The lease's id and the idempotency key that came with it.
     deadline_s
-        How long it is given from ``asked_s`` on, seconds of the daemon's clock; None for the usual time.
-    asked_s
-        When it came, by the daemon's clock; needed for a deadline only.
+        How long it is given from ``came_s`` on, seconds of the daemon's clock; None for the usual time.
     last_stop
         `mastctl.control.lease.LeaseTable.last_stop` when it came: what steers is not carried out after a
         later one. None: that is not known.
     """
 
     caller: Caller
-    asked_s: float = 0.0
+    came_s: float = 0.0
     request: Mapping[str, Any] = field(default_factory=dict)
     lease: str | None = None
     key: str | None = None
@@ -141,11 +137,10 @@ class CommandRequest:
 
 
 class JudgesAndEnds(Protocol):
-    """What of `mastctl.control.operations.OperationRunner` refuses a command, and ends an operation that is
-    late, or was requested before a stop."""
+    """What of `mastctl.control.operations.OperationRunner` refuses a command, and ends an operation."""
 
     def refusal(self, need: Need) -> MastctlError | None: ...
-    def end_within(self, name: str, left_s: float, told_s: float) -> None: ...
+    def end_within(self, name: str, left_s: float, allowed_s: float) -> None: ...
     def end_stopped(self, name: str) -> None: ...
 
 
@@ -156,8 +151,6 @@ class CommandEntry:
     ----------
     clock
         The clock of deadlines and records: the daemon's.
-    leases, answers, audit
-        The client that steers, the answers by key, the log of records.
     operations
         Refuses what does not fit the state, and ends operations at their deadline.
     publisher
@@ -191,109 +184,104 @@ class CommandEntry:
         self._ended: dict[str, dict[str, Any]] = {}  # operation: how it ended, until its client is known
 
     def run(
-        self, command: Command, asked: CommandRequest, act: Callable[[], Answer], usual_s: float | None = None
+        self, command: Command, sent: CommandRequest, act: Callable[[], Answer], usual_s: float | None = None
     ) -> Answer:
-        """Carry out a command and return its answer; an operation that it starts is named by ``id`` or
-        ``operation`` there.
+        """Carry out a command by ``act``; return its answer, whose ``id`` or ``operation`` names what runs.
 
-        Parameters
-        ----------
-        command
-            Its kind.
-        asked
-            The request.
-        act
-            Carries it out.
-        usual_s
-            The time allowed for an operation without a deadline, seconds.
+        ``usual_s`` is the time allowed for an operation without a deadline, seconds.
 
-        Raises
-        ------
-        NotAllowed
-            ``role``.
-        BadRequest
-            ``key_reused``; ``bad_request`` for a key of nobody's name where a lease is granted.
-        NotNow
-            ``deadline_passed`` if its time was over before it began; ``leased``, ``lease_over``,
-            ``lease_unknown``; ``key_in_use``; ``stopped`` if a stop came since it was asked for; what the
-            state refuses.
+        Raises NotAllowed ``role``; BadRequest ``key_reused``; ``bad_request`` for a key without a name where
+        a lease is granted; NotNow ``deadline_passed`` if its time was over before it began; ``leased``,
+        ``lease_over``, ``lease_unknown``; ``key_in_use``; ``stopped`` if a stop came since it was sent; what
+        the state refuses.
         """
         again = False
         try:
-            asked.caller.check_may(command.role, command.name)
-            if command.grants and asked.key is not None and asked.caller.name == ANONYMOUS:
+            sent.caller.check_may(command.role, command.name)
+            if command.grants and sent.key is not None and sent.caller.name == ANONYMOUS:
                 message = "a lease with an Idempotency-Key needs a name (Mastctl-Client)"
                 raise BadRequest("bad_request", message)
-            if asked.key is None:
-                answer = self._act(command, asked, act, usual_s)
+            if sent.key is None:
+                answer = self._act(command, sent, act, usual_s)
             else:
-                same = {"command": command.name, "request": asked.request}
+                same = {"command": command.name, "request": sent.request}
                 answer, again = self._answers.once(
-                    asked.caller.name, asked.key, same, lambda: self._act(command, asked, act, usual_s)
+                    sent.caller.name, sent.key, same, lambda: self._act(command, sent, act, usual_s)
                 )
                 if again and command.grants:
                     self._check_holds(answer["lease_id"])
         except BaseException as error:
-            self._record(command, asked, None, error, again)
+            self._record(command, sent, None, error, again)
             raise
-        self._record(command, asked, answer, None, again)
+        self._record(command, sent, answer, None, again)
         return answer
 
-    def first(self, command: Command, asked: CommandRequest, act: Callable[[], Answer]) -> Answer:
-        """Carry out a stop: it acts before anything is checked or written, and is recorded after."""
-        by = asked.caller.name
+    def first(
+        self, command: Command, sent: CommandRequest, act: Callable[[], Answer], recorded: bool = True
+    ) -> Answer:
+        """Carry out a stop: it acts before anything is checked or written, and is ``recorded`` after."""
+        by = sent.caller.name
         how = f"an emergency stop ({by})" if command is ESTOP else by
         self.leases.stop_came(f"the head was stopped by {how}")  # takes no lock
+        answer, error = None, None
         try:
             answer = act()
-        except BaseException as error:
-            self._record(command, asked, None, error, begins=False)
+            return answer
+        except BaseException as failure:
+            error = failure
             raise
-        self._record(command, asked, answer, None, begins=False)
-        return answer
+        finally:
+            if recorded:
+                self.note(command, sent, answer, error)
 
-    def note(self, command: Command, asked: CommandRequest, error: Exception | None = None) -> None:
-        """Record a stop that could not even be tried, or the reason that came after its stop."""
-        self._record(command, asked, {}, error, begins=False)
+    def note(
+        self,
+        command: Command,
+        sent: CommandRequest,
+        answer: Mapping[str, Any] | None,
+        error: BaseException | None,
+    ) -> None:
+        """Record a stop that could not even be tried, or one whose reason came after it."""
+        self._record(command, sent, answer, error, begins=False)
 
     def refused(self, caller: Caller, command: str, code: str, message: str) -> None:
         """Record a request that was refused before it was a command. It is not published."""
-        told = {"number": next(self._numbers), **self._now(), **_who(command, caller), "request": {}}
-        told |= {"result": code, "message": message}
-        (self.strangers if caller.stranger else self.audit).put(told)
+        line = {"number": next(self._numbers), **self._now(), **_by(command, caller), "request": {}}
+        line |= {"result": code, "message": message}
+        (self.strangers if caller.stranger else self.audit).put(line)
 
     def ended(self, operation: str, state: str, error: Mapping[str, Any] | None) -> None:
         """Record how an operation ended that a command began."""
-        told = {**self._now(), "ended": operation, "state": state}
+        line = {**self._now(), "ended": operation, "state": state}
         if error is not None:
-            told |= {"code": error.get("code"), "message": error.get("message")}
-        self._matched(self._ended, operation, told)
+            line |= {"code": error.get("code"), "message": error.get("message")}
+        self._matched(self._ended, operation, line)
 
     def _act(
-        self, command: Command, asked: CommandRequest, act: Callable[[], Answer], usual_s: float | None
+        self, command: Command, sent: CommandRequest, act: Callable[[], Answer], usual_s: float | None
     ) -> Answer:
         """Carry it out if no check fails; its operation gets its deadline."""
-        if asked.deadline_s is not None and self._left_s(asked, asked.deadline_s) <= 0.0:
-            message = f"the {asked.deadline_s:g} s for {command.name} were over before it could begin"
+        if sent.deadline_s is not None and self._left_s(sent, sent.deadline_s) <= 0.0:
+            message = f"the {sent.deadline_s:g} s for {command.name} were over before it could begin"
             raise NotNow("deadline_passed", message)
-        if self._stopped_since(command, asked):
+        if self._stopped_since(command, sent):
             raise Stopped(
                 f"{command.name} was requested before a stop, and is not carried out; send it again"
             )
         steering: AbstractContextManager[None] = nullcontext()
         if command.steers:
-            steering = self.leases.steering(asked.caller, asked.lease)
+            steering = self.leases.steering(sent.caller, sent.lease)
         with steering:
             refusal = None if command.need is None else self._operations.refusal(command.need)
             if refusal is not None:
                 raise refusal
             answer = act()
             operation = _operation_of(answer)
-            if operation is not None and self._stopped_since(command, asked):
+            if operation is not None and self._stopped_since(command, sent):
                 self._operations.end_stopped(operation)
-            allowed_s = usual_s if asked.deadline_s is None else asked.deadline_s
+            allowed_s = usual_s if sent.deadline_s is None else sent.deadline_s
             if operation is not None and allowed_s is not None and operation not in self._began:
-                self._operations.end_within(operation, self._left_s(asked, allowed_s), allowed_s)
+                self._operations.end_within(operation, self._left_s(sent, allowed_s), allowed_s)
             return answer
 
     def _check_holds(self, lease_id: str) -> None:
@@ -303,57 +291,57 @@ class CommandEntry:
         except NotNow as over:
             raise NotNow(over.code, f"{over}, with another Idempotency-Key") from None
 
-    def _stopped_since(self, command: Command, asked: CommandRequest) -> bool:
+    def _stopped_since(self, command: Command, sent: CommandRequest) -> bool:
         """Whether a stop came after the request of a command that steers."""
-        return command.steers and asked.last_stop not in (None, self.leases.last_stop)
+        return command.steers and sent.last_stop not in (None, self.leases.last_stop)
 
-    def _left_s(self, asked: CommandRequest, allowed_s: float) -> float:
-        return asked.asked_s + allowed_s - self._clock.now_s()
+    def _left_s(self, sent: CommandRequest, allowed_s: float) -> float:
+        return sent.came_s + allowed_s - self._clock.now_s()
 
     def _record(
         self,
         command: Command,
-        asked: CommandRequest,
+        sent: CommandRequest,
         answer: Mapping[str, Any] | None,
         error: BaseException | None,
         again: bool = False,
         begins: bool = True,
     ) -> None:
         """Record a command's result; ``begins``: whether it began the operation that its answer names."""
-        caller = asked.caller
+        caller = sent.caller
         operation = None if answer is None else _operation_of(answer)
         if command.goes_on and error is None and (operation is None or operation in self._began):
             return
-        who = _who(command.name, caller)
+        by = _by(command.name, caller)
         number = next(self._numbers)
-        told = {"number": number, **self._now(), **who, "request": writable(asked.request)}
-        if asked.lease is not None:
-            told["lease"] = asked.lease[:8]  # names it, without being it
-        if asked.key is not None:
-            told |= {"key": asked.key[:80], "again": again}
+        line = {"number": number, **self._now(), **by, "request": writable(sent.request)}
+        if sent.lease is not None:
+            line["lease"] = sent.lease[:8]  # names it, without being it
+        if sent.key is not None:
+            line |= {"key": sent.key[:80], "again": again}
         if error is None:
-            told |= {"result": "ok", "operation": operation}
+            line |= {"result": "ok", "operation": operation}
         else:
             body = error_body(error)
-            told |= {"result": body["code"], "message": body["message"]}
-        self._tell(told)
+            line |= {"result": body["code"], "message": body["message"]}
+        self._write(line)
         if operation is not None and begins and not again:
-            self._matched(self._began, operation, {"number": number, **who})
+            self._matched(self._began, operation, {"number": number, **by})
 
-    def _matched(self, known: dict[str, dict[str, Any]], operation: str, told: dict[str, Any]) -> None:
+    def _matched(self, known: dict[str, dict[str, Any]], operation: str, line: dict[str, Any]) -> None:
         """Keep an operation's client, or how it ended; record the end when both are known."""
         with self._matching:
-            known[operation] = told
+            known[operation] = line
             if operation in self._began and operation in self._ended:
-                self._tell({**self._began.pop(operation), **self._ended.pop(operation)})
+                self._write({**self._began.pop(operation), **self._ended.pop(operation)})
             while len(known) > FOLLOWED:
                 del known[next(iter(known))]
 
-    def _tell(self, told: dict[str, Any]) -> None:
-        stranger = told["via"] == NETWORK
-        (self.strangers if stranger else self.audit).put(told)
-        key = f"{told['number']}.end" if "ended" in told else f"{told['number']}"
-        self._publisher.publish("command", key, told)
+    def _write(self, line: dict[str, Any]) -> None:
+        stranger = line["via"] == NETWORK
+        (self.strangers if stranger else self.audit).put(line)
+        key = f"{line['number']}.end" if "ended" in line else f"{line['number']}"
+        self._publisher.publish("command", key, line)
         keys, most = self._published[stranger], PUBLISHED_OF_STRANGERS if stranger else PUBLISHED
         keys.append(key)
         while len(keys) > most:
@@ -363,10 +351,10 @@ class CommandEntry:
         return {"time": datetime.now(UTC).isoformat(), "monotonic_s": self._clock.now_s()}
 
 
-def _who(command: str, caller: Caller) -> dict[str, Any]:
+def _by(command: str, caller: Caller) -> dict[str, Any]:
     """A command and its caller, as they are recorded."""
-    who = {"command": command, "who": caller.name, "role": caller.role, "via": caller.via}
-    return who | ({"address": caller.address} if caller.address else {})
+    by = {"command": command, "who": caller.name, "role": caller.role, "via": caller.via}
+    return by | ({"address": caller.address} if caller.address else {})
 
 
 def _operation_of(answer: Mapping[str, Any]) -> str | None:

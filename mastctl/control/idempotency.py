@@ -38,12 +38,8 @@ class _Kept:
 class Answers:
     """The answers by their keys; safe to use from any thread.
 
-    Parameters
-    ----------
-    clock
-        By which answers are forgotten.
-    waits_on
-        On which the second of two waits while the first is at work; the service's clock.
+    ``clock`` is that by which answers are forgotten; the second of two waits on ``waits_on``, the service's,
+    while the first is at work.
     """
 
     def __init__(self, clock: Clock, waits_on: Clock | None = None) -> None:
@@ -56,21 +52,9 @@ class Answers:
     ) -> tuple[Answer, bool]:
         """Return what ``act()`` returns, or returned before, and whether it was before.
 
-        Parameters
-        ----------
-        client
-            The key's client: another's is another key.
-        key
-            Printable ASCII, up to 200 characters.
-        request
-            The same whenever the key is.
-
-        Raises
-        ------
-        BadRequest
-            ``key_reused`` if the key came with another request, ``bad_request`` for what is no key.
-        NotNow
-            ``key_in_use`` if the first is still at work after 30 s.
+        A key is 1 to 200 signs of printable ASCII; another client's is another key, and ``request`` the same
+        whenever the key is. Raises BadRequest ``key_reused`` if it came with another request, ``bad_request``
+        for what is no key; NotNow ``key_in_use`` if the first is still at work after 30 s.
         """
         if not (0 < len(key) <= LONGEST_KEY and key.isascii() and key.isprintable()):
             expected = f"1 to {LONGEST_KEY} printable ASCII characters are expected"
@@ -102,7 +86,7 @@ class Answers:
         return answer, False
 
     def _answer_of(self, known: _Kept, key: str, request: Mapping[str, Any]) -> Any:
-        """Return the answer that the first got, or gets; the lock is held."""
+        """Return the answer that the first got, or gets; the lock is kept."""
         if known.request != request:
             message = f"Idempotency-Key '{key[:40]}' came before with another request; take a new one"
             raise BadRequest("key_reused", message)

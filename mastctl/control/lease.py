@@ -4,7 +4,7 @@ A lease runs on the machine's clock, however fast a simulated rover's goes: it b
 be silent, and clients live in real time. It runs until just before its end. Its id proves it, so only its
 holder's answers have it. Whatever ends a lease stops the motion that was begun under it.
 
-Reading from here (`LeaseTable.control`) takes no lock.
+Reading (`LeaseTable.control`) takes no lock.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ REMEMBERED = 64  # ended leases for which a refusal still states how they ended
 class Leased(NotNow):
     """Another client steers; ``detail`` has its name, and for how long."""
 
-    def __init__(self, control: WhoSteers, now_s: float) -> None:
-        self.detail = control.told(now_s)
+    def __init__(self, control: Steerer, now_s: float) -> None:
+        self.detail = control.as_json(now_s)
         super().__init__("leased", f"{control.sentence(now_s)}; wait, or take over with a reason")
 
 
@@ -51,7 +51,7 @@ class LeaseOver(NotNow):
 
 @dataclass(frozen=True, eq=False)
 class StopCame:
-    """A stop that came; ``how`` tells which, and by whom."""
+    """A stop that came; ``how`` says which, and by which client."""
 
     how: str = "the head was stopped"
 
@@ -75,31 +75,21 @@ class Lease:
 
 
 @dataclass(frozen=True)
-class WhoSteers:
-    """The client that steers.
-
-    Attributes
-    ----------
-    holder
-        Its name.
-    kind
-        ``lease``, or ``operation``: it steers until what it started has ended.
-    until_s
-        When a lease ends, seconds of its clock; None for an operation.
-    """
+class Steerer:
+    """The client that steers, by a lease until ``until_s`` of its clock, or until what it began has ended."""
 
     holder: str
     kind: Literal["lease", "operation"]
     until_s: float | None = None
 
-    def told(self, now_s: float) -> ControlTold:
+    def as_json(self, now_s: float) -> ControlTold:
         """Return it as JSON: what is left in seconds, and when that is by the wall clock (UTC)."""
         left_s = None if self.until_s is None else max(0.0, self.until_s - now_s)
         until = None if left_s is None else _by_the_wall(left_s)
         return {"holder": self.holder, "kind": self.kind, "for_s": left_s, "until": until}
 
     def sentence(self, now_s: float) -> str:
-        """Return it in plain words."""
+        """Return it as a sentence."""
         if self.until_s is None:
             return f"{self.holder} steers, until what runs has ended"
         return f"{self.holder} steers, for {max(0.0, self.until_s - now_s):.1f} s more"
@@ -108,28 +98,18 @@ class WhoSteers:
 class LeaseTable:
     """The lease of one daemon, or the client that steers without one; safe to use from any thread.
 
-    Parameters
-    ----------
-    clock
-        The clock of the leases.
-    running
-        Whether an operation or a track runs; called with the lock held, so it must take none.
-    on_change
-        Gets the client that steers after each change.
-    stop
-        Stops what runs; gets the reason. Called without the lock.
+    ``running``: whether an operation or a track runs; called with the lock kept, so it must take none.
+    ``on_change``: gets the client that steers after each change. ``stop``: stops what runs; gets the reason.
+    Called without the lock.
 
-    Attributes
-    ----------
-    stands
-        Whether a token is still valid, by its digest; called with the lock held, from any thread.
+    ``stands``: whether a token is still valid, by its digest; called with the lock kept, from any thread.
     """
 
     def __init__(
         self,
         clock: Clock,
         running: Callable[[], bool],
-        on_change: Callable[[WhoSteers | None], None] = lambda control: None,
+        on_change: Callable[[Steerer | None], None] = lambda control: None,
         stop: Callable[[str], object] = lambda why: None,
     ) -> None:
         self._clock = clock
@@ -142,25 +122,25 @@ class LeaseTable:
         self._lease: Lease | None = None
         self._over: dict[str, str] = {}  # id of an ended lease: how it ended
         self._under_way: dict[object, str] = {}  # commands that are being carried out: their party
-        self._party: str | None = None  # who started what runs
+        self._party: str | None = None  # the client that started what runs
         self._left = ""  # why what runs is to be stopped: its lease has ended
         self._closing = threading.Event()
 
-    def control(self) -> WhoSteers | None:
+    def control(self) -> Steerer | None:
         """Return the client that steers now, None without one."""
         lease = self._lease
         if lease is not None and not self._over_by(lease):
-            return WhoSteers(lease.holder, "lease", lease.until_s)
+            return Steerer(lease.holder, "lease", lease.until_s)
         under_way = next(iter(tuple(self._under_way.values())), None)
         party = under_way or (self._party if self._running() else None)
-        return None if party is None else WhoSteers(party, "operation")
+        return None if party is None else Steerer(party, "operation")
 
-    def told(self) -> ControlTold | None:
+    def as_json(self) -> ControlTold | None:
         """Return the client that steers as ``GET /status`` has it."""
         control = self.control()
-        return None if control is None else control.told(self._clock.now_s())
+        return None if control is None else control.as_json(self._clock.now_s())
 
-    def told_of(self, lease: Lease) -> LeaseRuns:
+    def lease_as_json(self, lease: Lease) -> LeaseRuns:
         """Return a lease as its holder gets it, whichever client steers meanwhile."""
         left_s = max(0.0, lease.until_s - self._clock.now_s())
         return {"holder": lease.holder, "for_s": left_s, "until": _by_the_wall(left_s)}
@@ -181,25 +161,10 @@ class LeaseTable:
     def acquire(
         self, caller: Caller, name: str | None = None, for_s: float = USUAL_S, ends_with_stop: bool = False
     ) -> Lease:
-        """Return a new lease if no other client steers.
+        """Return a new lease of ``for_s`` seconds if no other client steers; what the caller runs is its own.
 
-        Parameters
-        ----------
-        caller
-            The client. What its name has running is no obstacle.
-        name
-            The holder's name, the caller's by default.
-        for_s
-            How long, seconds.
-        ends_with_stop
-            Whether it ends with the next stop of the head.
-
-        Raises
-        ------
-        Leased
-            If another client steers.
-        BadRequest
-            If ``for_s`` is out of bounds.
+        ``name`` is the holder's, the caller's by default. With ``ends_with_stop`` it ends with the next stop
+        of the head. Raises Leased; BadRequest if ``for_s`` is out of bounds.
         """
         _check_time(for_s)
         with self._changing():
@@ -246,12 +211,8 @@ class LeaseTable:
     def renew(self, lease_id: str, for_s: float | None = None) -> Lease:
         """Have a lease run for ``for_s`` seconds from now on, by default as long as at first; return it.
 
-        Raises
-        ------
-        NotNow
-            ``lease_over`` with how it ended, ``lease_unknown``.
-        BadRequest
-            If ``for_s`` is out of bounds.
+        Raises NotNow ``lease_over`` with how it ended, ``lease_unknown``; BadRequest if ``for_s`` is out of
+        bounds.
         """
         if for_s is not None:
             _check_time(for_s)
@@ -279,13 +240,9 @@ class LeaseTable:
     ) -> Lease:
         """Return a new lease, whichever client steers; the former holder gets the new one's name and reason.
 
-        What runs under a lease is stopped. With ``last_stop`` the new one ends with the first stop after that
-        one. Other parameters and exceptions as of `acquire`.
-
-        Raises
-        ------
-        DriverError
-            If the head did not confirm the stop; there is no lease then.
+        What runs under a lease is stopped; there is no lease if the head does not confirm that. With
+        ``last_stop`` the new one ends with the first stop after that one. Else as `acquire`; raises
+        DriverError, BadRequest.
         """
         _check_time(for_s)
         with self._changing():
@@ -302,13 +259,7 @@ class LeaseTable:
         """Let a command that steers be carried out inside the block; waits for nothing.
 
         Until it has ended, and what it started too, no other client gets a lease or steers, unless by `take`.
-
-        Raises
-        ------
-        Leased
-            If another client steers.
-        NotNow
-            ``lease_over``, ``lease_unknown``, for the lease that came with it.
+        Raises Leased; NotNow ``lease_over``, ``lease_unknown``, for the lease that came with it.
         """
         ticket = object()
         lease: Lease | None = None
@@ -331,11 +282,11 @@ class LeaseTable:
                     if lease is not None and (how := self._over.get(lease.id)):  # meanwhile
                         self._leave_running(lease, how)
 
-    # With the lock held
+    # The lock is kept
 
     @contextmanager
     def _changing(self) -> Iterator[None]:
-        """Hold the lock, with a lease that has run out ended; report a change after it."""
+        """Keep the lock, with a lease that has run out ended; report a change after it."""
         changed = False
         try:
             with self._lock:

@@ -3,10 +3,9 @@
 This module does not know how to point. It runs what it is given, keeps the record, and makes sure that a
 stop is final: from its request until the operation has ended, no move goes out.
 
-What is read from here (`OperationRunner.get`, `.all`) is read without a lock: the records are a mapping
-that is replaced, never edited. The lock is for those that write, and is not held while anything else is
-waited for. The machine (`mastctl.control.machine`) gets what runs and what is being stopped, its publisher
-each change of a record.
+Records are read without a lock: they are a mapping that is replaced, never edited. The lock is for those that
+write, and is not kept while anything else is waited for. The machine (`mastctl.control.machine`) gets what
+runs and what is being stopped, its publisher each change of a record.
 """
 
 from __future__ import annotations
@@ -24,9 +23,8 @@ from calib.errors import CalibError
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import DriverError
 from mastctl.answers import OperationState
-from mastctl.control.machine import StateMachine
+from mastctl.control.machine import Need, StateMachine
 from mastctl.control.records import Operation, last_residual
-from mastctl.control.refusals import Need
 from mastctl.control.standing import CLOSING
 from mastctl.errors import MastctlError, NotKnown, NotNow, Stopped, Unable, error_body
 
@@ -34,10 +32,10 @@ log = logging.getLogger(__name__)
 
 KEPT_OPERATIONS = 200
 END_TIMEOUT_S = 5.0  # for a cancelled operation to notice, when the service closes
-REASON_S = 2.0  # what the record of an operation waits for the reason of a stop that came without it
-ENDS_SOON_S = 0.25  # a stopped operation ends within 20 ms or so; the next command waits for that
+REASON_S = 2.0  # how long the record of an operation waits for the reason of a stop that came without it
+ENDS_SOON_S = 2.0  # a stopped operation ends its computation first; the next command waits for that
 
-STOP_ASKED = "a stop was asked for"
+STOP_ASKED = "a stop was requested"
 
 
 class Mover(Protocol):
@@ -55,18 +53,9 @@ OnEnd = Callable[[Operation], None]
 class OperationRunner:
     """The operations of this run of the service; safe to use from any thread.
 
-    Parameters
-    ----------
-    mover
-        Stops the mast.
-    clock
-        Stamps the records.
-    run
-        A word in every id, so that an id from before a restart names nothing; a random one by default.
-    on_ended
-        Gets the last record of each operation, in its thread; must return at once.
-    machine
-        Gets what runs, and refuses what may not begin now; one of its own by default.
+    ``run``: A part of every id, so that an id from before a restart names nothing; a random one by default;
+    ``on_ended``: gets the last record of each operation, in its thread; must return at once; ``machine``:
+    gets what runs, and refuses what may not begin now; one of its own by default.
     """
 
     def __init__(
@@ -90,9 +79,9 @@ class OperationRunner:
         self._on_ended = on_ended
         self._current: tuple[str, threading.Event, threading.Thread] | None = None
         self._closed = False
-        self._stops_of_its_own = (
-            0  # under way, for operations beyond their deadline; whoever waits, waits by `_ended`
-        )
+        self._stops_of_its_own = 0  # under way, for operations beyond their deadline
+        self._deadline: tuple[str, float, MastctlError] | None = None  # of an operation; what ends it then
+        self._time.thread(self._watch, "deadlines").start()
         self._cancelled_because: MastctlError = Stopped(STOP_ASKED)
         self._reason_is_known = threading.Event()
         self._reason_is_known.set()
@@ -106,14 +95,8 @@ class OperationRunner:
         """Start ``work(record_step, cancelled)`` in a thread and return its first record.
 
         ``on_end`` gets the last record, in the same thread, when the next operation may be started already.
-        Waits for nothing: `let_stopped_end` does, before any lock is taken.
-
-        Raises
-        ------
-        NotNow
-            ``busy``, ``stopping``, ``latched``: as `StateMachine.refusal` of ``motion``.
-        Unable
-            ``no_thread`` if the machine has none for it (the record says so too), ``closing``.
+        Waits for nothing: `let_stopped_end` does, before any lock is taken. Raises as `StateMachine.refusal`
+        of ``motion``; Unable ``no_thread`` if the machine has none for it (the record says so too).
         """
         with self._lock:
             name = f"{next(self._numbers):06d}-{self._run}"
@@ -137,7 +120,7 @@ class OperationRunner:
     def held(self) -> Iterator[None]:
         """Let no operation start and no move go out inside the block; waits for nothing."""
         hold = object()
-        self._machine.stop_asked()
+        self._machine.stop_requested()
         self._mover.block_moves(hold, STOP_ASKED)
         try:
             yield
@@ -145,16 +128,17 @@ class OperationRunner:
             self._mover.allow_moves(hold)
             self._machine.stop_ended()
 
-    def stop(self, reason: str = STOP_ASKED, reason_follows: bool = False) -> str | None:
-        """Stop the mast, then the running operation, if any; return its id.
+    def stop(
+        self,
+        reason: str = STOP_ASKED,
+        reason_follows: bool = False,
+        also: Callable[[], object] = lambda: None,
+    ) -> str | None:
+        """Stop the mast, then the running operation, if any, and what ``also`` ends; return its id.
 
         The head comes first: nothing is written before its stop was sent. ``reason`` goes into the
-        operation's record; if a better ``reason_follows``, the record waits for it (`explain`).
-
-        Raises
-        ------
-        DriverError
-            If the head did not confirm the stop; the operation is stopped all the same.
+        operation's record; if a better ``reason_follows``, the record waits for it (`explain`). Raises
+        DriverError if the head did not confirm the stop; the operation is stopped all the same.
         """
         with self.held():
             running = self._current
@@ -168,6 +152,7 @@ class OperationRunner:
             finally:
                 with self._lock:
                     name = self._cancel(reason)
+                also()
         if name is None and running is not None and self.get(running[0]).state == "stopped":
             name = running[0]
         log.info("stop%s", f": operation {name}" if name else "")
@@ -180,17 +165,14 @@ class OperationRunner:
         self._reason_is_known.set()
 
     def refusal(self, need: Need) -> MastctlError | None:
-        """Return why a command may not be carried out now, as `mastctl.control.machine.StateMachine.refusal`.
-
-        What a stop has ended may end first (`let_stopped_end`).
-        """
+        """Return the refusal of a command, as `StateMachine.refusal`; what was stopped may end first."""
         self.let_stopped_end()
         return self._machine.refusal(need)
 
     def let_stopped_end(self) -> None:
         """Wait for an operation that is being ended, and for a deadline's stop; `ENDS_SOON_S` at most.
 
-        Returns at once if there is none. Who asks for a stop is answered when the head has confirmed it.
+        Returns at once if there is none. A stop itself is answered when the head has confirmed it.
         """
         until_s = self._time.now_s() + ENDS_SOON_S
         with self._ended:
@@ -205,52 +187,41 @@ class OperationRunner:
         return self._stops_of_its_own > 0 or (current is not None and current[1].is_set())
 
     def end_within(self, name: str, left_s: float, allowed_s: float) -> None:
-        """Stop the mast and end an operation with ``deadline_passed`` if it runs longer; returns at once.
+        """Stop the mast and end an operation with ``deadline_passed`` if it runs longer than ``left_s``.
 
-        A stop that comes before is the last word.
-
-        Parameters
-        ----------
-        left_s
-            How long it may run from now on, seconds.
-        allowed_s
-            Of how long altogether; for the message.
+        ``allowed_s`` is how long altogether, for the message. A stop that comes before is the last word.
         """
-        until_s = self._time.now_s() + left_s
         late = NotNow("deadline_passed", f"operation {name} did not end in the {allowed_s:g} s it was given")
+        with self._ended:
+            if (current := self._current) is not None and current[0] == name:
+                self._deadline = name, self._time.now_s() + left_s, late
+                self._ended.notify_all()
 
-        def watch() -> None:
+    def _watch(self) -> None:
+        """End each operation at its deadline, in a thread of its own."""
+        while True:
             with self._ended:
-                while (current := self._current) is not None and current[0] == name:
-                    wait_s = until_s - self._time.now_s()
-                    if wait_s <= 0.0:
-                        break
-                    self._ended.wait(wait_s, idle=True)
-                else:
+                if self._closed:
                     return
+                if self._deadline is None:
+                    self._ended.wait(idle=True)
+                    continue
+                name, until_s, late = self._deadline
+                wait_s = until_s - self._time.now_s()
+                if wait_s > 0.0:
+                    self._ended.wait(wait_s, idle=True)
+                    continue
+                self._deadline = None
             self._end_by(name, late)
 
-        try:
-            self._time.thread(watch, f"deadline of {name}").start()
-        except RuntimeError as error:
-            message = f"operation {name} was ended, since nothing could watch its deadline: {error}"
-            self._end_by(name, Unable("no_thread", message))
-
     def end_stopped(self, name: str, reason: str = STOP_ASKED) -> None:
-        """Stop the mast and end an operation if it runs: one that began after a stop which came before it was
-        let begin, or one that is for nothing any more.
-        """
+        """Stop the mast and end an operation if it runs: it began after a stop, or is of no use any more."""
         self._end_by(name, Stopped(reason))
 
     def stop_one(self, name: str) -> None:
         """Stop the mast and one operation, if it runs; nothing where it has ended, or another one runs.
 
-        Raises
-        ------
-        NotKnown
-            As `get`.
-        DriverError
-            If the head did not confirm the stop; the operation is stopped all the same.
+        Raises as `get`; DriverError if the head did not confirm the stop.
         """
         self.get(name)
         error = self._end_by(name, Stopped(STOP_ASKED))
@@ -258,13 +229,7 @@ class OperationRunner:
             raise error
 
     def get(self, name: str) -> Operation:
-        """Return one record.
-
-        Raises
-        ------
-        NotKnown
-            ``operation_unknown`` if this run of the service does not know it, or no longer.
-        """
+        """Return one record. Raises NotKnown ``operation_unknown`` if it is not of this run, or not kept."""
         operation = self._records.get(name)
         if operation is None:
             message = f"operation {name[:80]} is not known; the newest {KEPT_OPERATIONS} of this run are kept"
@@ -282,10 +247,12 @@ class OperationRunner:
         """
         if self._closed:
             return
-        self._closed = True
+        with self._ended:
+            self._closed = True
+            self._ended.notify_all()
         self._machine.closing()
         self._mover.block_moves(self, CLOSING)
-        self._stop_unasked("as the service closes")
+        self._stop_anyway("as the service closes")
         with self._lock:
             current = self._current
             self._cancel(CLOSING)
@@ -310,16 +277,16 @@ class OperationRunner:
             self._cancelled_because = error
             current[1].set()
             self._mover.block_moves(name, str(error))
-        self._machine.stop_asked()
-        unconfirmed = self._stop_unasked(f"when operation {name} was to end")
+        self._machine.stop_requested()
+        unconfirmed = self._stop_anyway(f"when operation {name} was to end")
         self._machine.stop_ended()
         with self._ended:
             self._stops_of_its_own -= 1
             self._ended.notify_all()
         return unconfirmed
 
-    def _stop_unasked(self, when: str) -> BaseException | None:
-        """Stop the mast where no client waits for the answer; return whatever its driver raises."""
+    def _stop_anyway(self, when: str) -> BaseException | None:
+        """Stop the mast where no client waits for the answer; return what its driver raises."""
         try:
             self._mover.stop()
         except BaseException as error:
@@ -328,7 +295,7 @@ class OperationRunner:
         return None
 
     def _keep(self, operation: Operation) -> None:
-        """Keep a record, and forget the oldest; the lock is held."""
+        """Keep a record, and forget the oldest; the lock is kept."""
         records = {**self._records, operation.id: operation}
         while len(records) > KEPT_OPERATIONS:
             oldest = next(iter(records))
@@ -338,7 +305,7 @@ class OperationRunner:
         self._publisher.publish("operation", operation.id, operation)
 
     def _cancel(self, reason: str) -> str | None:
-        """Tell the running operation to end and let no further move of it out; the lock is held."""
+        """Have the running operation end and let no further move of it out; the lock is kept."""
         if self._current is None:
             return None
         name, cancelled, _ = self._current
@@ -350,11 +317,11 @@ class OperationRunner:
     def _work(self, name: str, work: Work, cancelled: threading.Event, on_end: OnEnd | None) -> None:
         """Run one operation, then hand over its last record."""
         self._run_to_end(name, work, cancelled)
-        for tell in (self._on_ended, on_end):
-            if tell is None:
+        for hand_over in (self._on_ended, on_end):
+            if hand_over is None:
                 continue
             try:
-                tell(self.get(name))
+                hand_over(self.get(name))
             except Exception:  # its record is closed
                 log.exception("a step after operation %s met a defect of the program", name)
 
@@ -382,7 +349,7 @@ class OperationRunner:
             self._end(name, "done", result, None)
             log.info("operation %s done", name)
             return
-        self._stop_unasked(f"after operation {name}")
+        self._stop_anyway(f"after operation {name}")
         partial = getattr(error, "result", None)
         if cancelled.is_set():
             self._reason_is_known.wait(REASON_S)
@@ -413,4 +380,6 @@ class OperationRunner:
                 self._keep(replace(known, state=state, result=result, error=error, ended_s=ended_s))
             self._current = None  # after the record, which a waiting client reads
         with self._ended:
+            if self._deadline is not None and self._deadline[0] == name:
+                self._deadline = None
             self._ended.notify_all()

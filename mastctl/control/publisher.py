@@ -1,7 +1,7 @@
-"""Each change of state published once, to listeners that get the newest and never hold anybody up.
+"""Each change of state published once, to listeners that get the newest and never delay a publisher.
 
 A subscriber has at most one value of each topic and key waiting for it. One that is slow loses values in
-between, never the newest, and is told how many it lost: `Publisher.publish` neither waits nor queues. A
+between, never the newest, and knows how many it lost: `Publisher.publish` neither waits nor queues. A
 listener that counts may request every value, up to a bound beyond which it loses the oldest.
 
     topic       key                 value
@@ -11,9 +11,9 @@ listener that counts may request every value, up to a bound beyond which it lose
     track       "track"             `mastctl.motion.track.TrackStatus`
     fault       of a device, file   tuple of `mastctl.control.standing.StandingFault`, empty when healthy
     frame       the camera's name   facts of its newest frame, without the picture
-    mast        "in_use"            the mast file in use, as `GET /mast` tells it
+    mast        "in_use"            the mast file in use, as `GET /mast` has it
     command     its number          the record of a command; under NUMBER.end how what it began has ended
-    lease       "lease"             who steers
+    lease       "lease"             the client that steers
     bench       "run"               `mastctl.answers.BenchRunRecord`, the bench calibration as it is known
 """
 
@@ -44,13 +44,7 @@ GONE: Any = object()
 
 @dataclass(frozen=True, eq=False)
 class Published:
-    """A value of a topic and key, which is never edited.
-
-    Attributes
-    ----------
-    sequence
-        Grows with each value that is published, whatever its topic.
-    """
+    """A value of a topic and key, never edited. ``sequence`` grows with each value, whatever its topic."""
 
     sequence: int
     topic: Topic
@@ -61,12 +55,8 @@ class Published:
 class Subscription:
     """What one listener has not read yet. A context manager; one thread, or one coroutine, reads it.
 
-    Attributes
-    ----------
-    lost
-        How many values were replaced by newer ones before they were read, or found no room.
-    closed
-        Whether no more will come: it was closed, or its publisher was.
+    ``lost`` counts values that were replaced by newer ones before they were read, or found no room;
+    ``closed`` says that no more will come: it was closed, or its publisher was.
     """
 
     def __init__(
@@ -83,7 +73,7 @@ class Subscription:
         self._end = end
         self._every = every
         self._most = MOST_UNREAD
-        self._lock = threading.Lock()  # held while a value is put in or all are handed over, never for longer
+        self._lock = threading.Lock()  # for as long as a value is put in or all are handed over
         self._unread: dict[int | tuple[Topic, str], Published] = {}
 
     def close(self) -> None:
@@ -193,7 +183,7 @@ class LoopSubscription(Subscription):
 
 
 class Publisher:
-    """Hands each value to every listener; safe to use from any thread. Its lock is held for no listener."""
+    """Hands each value to every listener; safe to use from any thread. Its lock waits for no listener."""
 
     def __init__(self) -> None:
         self._numbers = itertools.count(1)
@@ -247,8 +237,7 @@ class Publisher:
         return len(self._subscriptions)
 
     def close(self) -> None:
-        """End every subscription, and each that is asked for later; publishing goes nowhere from then on."""
-
+        """End every subscription, and each that is made later; publishing goes nowhere from then on."""
         with self._lock:
             self._closed = True
             subscriptions, self._subscriptions = self._subscriptions, ()

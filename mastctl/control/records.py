@@ -31,7 +31,7 @@ class Operation:
         result = made if isinstance(made, dict) else {}
         pointings = result.get("pointings") or []
         last = pointings[-1] if pointings else {}
-        told: OperationListed = {
+        record: OperationListed = {
             "id": self.id,
             "state": self.state,
             "request": as_json(self.request),
@@ -48,10 +48,10 @@ class Operation:
             "pointings": pointings,
         }
         if "ended_because" in result:
-            told["ended_because"] = result["ended_because"]
-        return told
+            record["ended_because"] = result["ended_because"]
+        return record
 
-    def told(self) -> OperationTold:
+    def as_json(self) -> OperationTold:
         """Return the record as JSON with its steps."""
         return {**self.listed(), "steps": as_json(self.steps)}
 
@@ -61,15 +61,15 @@ def last_residual(result: Any, name: str) -> Residual | None:
     pointings = getattr(result, "pointings", None) or ()
     if not pointings:
         return None
-    told = as_json(pointings[-1])
-    residual, sigma = told.get("residual_px"), told.get("residual_sigma_px")
+    last = as_json(pointings[-1])
+    residual, sigma = last.get("residual_px"), last.get("residual_sigma_px")
     if not (residual and sigma and None not in residual and None not in sigma):
         return None
     return Residual((residual[0], residual[1]), (sigma[0], sigma[1]), name)
 
 
 def last_frame(result: Any) -> str | None:
-    """Return the id of the picture that a result ends with, None where it took none."""
+    """Return the id of the image that a result ends with, None where it took none."""
     pointings = getattr(result, "pointings", None) or ()
     frame_id = getattr(pointings[-1], "frame_id", None) if pointings else None
     return frame_id if isinstance(frame_id, str) and frame_id else None

@@ -1,4 +1,4 @@
-"""The cameras' settings: changed between operations, and kept as they are while one compares its pictures."""
+"""The cameras' settings: changed between operations, and kept while one compares its images."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
-from functools import partial
 from numbers import Real
 from typing import Any
 
@@ -15,6 +14,7 @@ from drivers.clock import Clock
 from drivers.errors import BadReply, BadSetting, DriverError
 from drivers.interfaces import SETTINGS, Camera, CameraSetting
 from mastctl.control.standing import StandingFault
+from mastctl.devices.frames import check_known
 from mastctl.devices.thread import DeviceThread
 from mastctl.errors import NotNow
 
@@ -25,12 +25,7 @@ SET_TIMEOUT_S = 2.0
 class CameraControls:
     """The settings of all cameras; safe from any thread.
 
-    Parameters
-    ----------
-    cameras, threads
-        By name; both may get other entries later.
-    clock
-        Stamps the faults.
+    ``cameras`` and ``threads`` may get other entries later. ``clock`` stamps the faults.
     """
 
     def __init__(
@@ -42,35 +37,28 @@ class CameraControls:
         self._holds = Counter[str]()  # of each camera, counted in its own thread
         self._refocused: Mapping[str, _Refocused] = {}  # replaced, never edited
 
-    def told(self, name: str) -> tuple[list[CameraSetting], bool]:
-        """Return what a camera is set to, and whether an operation holds it; empty if nothing can be changed.
+    def of(self, name: str) -> tuple[list[CameraSetting], bool]:
+        """Return what a camera is set to, and whether an operation keeps it; empty if nothing can change.
 
-        Raises
-        ------
-        NoReply, BadReply, DriverError
-            If the camera does not answer within 2 s.
+        Raises NotKnown; NoReply, BadReply, DriverError if the camera does not answer within 2 s.
         """
-        return self._threads[name].call("settings", lambda: self._told(name), SET_TIMEOUT_S, told=False)
+        check_known(name, self._cameras)
+        return self._threads[name].call("settings", lambda: self._read(name), SET_TIMEOUT_S, noted=False)
 
     def change(self, name: str, wanted: Mapping[str, float]) -> list[str]:
         """Change some of a camera's settings; return a sentence for each that became another than wanted.
 
-        Raises
-        ------
-        BadSetting
-            For one that it lacks, cannot change, or that is out of its bounds; nothing has changed then, but
-            what the sentence names.
-        NotNow
-            ``busy`` if an operation holds them.
-        NoReply, BadReply, DriverError
-            If the camera does not answer within 2 s.
+        Raises BadSetting: for one that it lacks, cannot change, or that is out of its bounds; nothing has
+        changed then, but what the sentence names; NotNow ``busy`` if an operation keeps them; NotKnown,
+        NoReply, BadReply, DriverError: as `of`.
         """
+        check_known(name, self._cameras)
 
         def change() -> list[str]:
             if self._holds[name]:
-                words = "an operation compares its pictures and holds its settings; wait for it or stop it"
-                raise NotNow("busy", f"{name}: {words}")
-            before, _ = self._told(name)
+                why = "an operation compares its pictures and holds its settings; wait for it or stop it"
+                raise NotNow("busy", f"{name}: {why}")
+            before, _ = self._read(name)
             changes = check_wanted(before, wanted, name)
             try:
                 notes = [str(note) for note in self._cameras[name].adjust(changes)]
@@ -81,18 +69,42 @@ class CameraControls:
             self._note_focus(name, wanted, before)
             return notes
 
-        return self._threads[name].call("adjust", change, SET_TIMEOUT_S, told=False)
+        return self._threads[name].call("adjust", change, SET_TIMEOUT_S, noted=False)
 
-    def hold(self, name: str) -> ExposureHold:
-        """Return a hold of one camera, which nothing but its begin and end changes."""
-        return ExposureHold(
-            self._threads[name],
-            partial(self._cameras.__getitem__, name),
-            lambda holds: self._holds.update({name: holds}),
-        )
+    def hold(self, name: str) -> Callable[[], None]:
+        """Keep a camera's exposure and settings as they are; return what ends that.
+
+        Both ends are queued in the camera's own thread, and no caller waits for them. The beginning comes
+        before every image that is taken after it, the end after the beginning, however late that is. So a
+        camera that hangs or refuses keeps no operation waiting; its fault says so.
+        """
+        context: list[AbstractContextManager[None]] = []
+        begun: list[bool] = []
+
+        def enter() -> None:
+            begun.append(True)
+            self._holds[name] += 1
+            one = self._cameras[name].exposure_held()
+            one.__enter__()
+            context.append(one)
+
+        def leave() -> None:
+            self._holds[name] -= len(begun)
+            if context:
+                context.pop().__exit__(None, None, None)
+
+        def release() -> None:
+            with suppress(DriverError):  # closed, and with it the camera
+                self._threads[name].submit("release_exposure", leave, HOLD_TIMEOUT_S, anyway=True)
+
+        try:
+            self._threads[name].submit("hold_exposure", enter, HOLD_TIMEOUT_S)
+        except DriverError:  # overdue or closed: its fault says so already, and it takes no images
+            return lambda: None
+        return release
 
     def calibrated(self) -> None:
-        """Take in that another mast file is in use: it is of the focus that each camera has now."""
+        """Treat the focus that each camera has now as that of the mast file, which came into use."""
         self._refocused = {}
 
     def faults(self) -> list[StandingFault]:
@@ -109,16 +121,16 @@ class CameraControls:
             for name, one in self._refocused.items()
         ]
 
-    def _told(self, name: str) -> tuple[list[CameraSetting], bool]:
-        """In the camera's thread: what it says, if that can be."""
-        return [_believed(one, name) for one in self._cameras[name].settings()], self._holds[name] > 0
+    def _read(self, name: str) -> tuple[list[CameraSetting], bool]:
+        """In the camera's thread: what it states, if that can be."""
+        return [_checked(one, name) for one in self._cameras[name].settings()], self._holds[name] > 0
 
     def _note_focus(self, name: str, wanted: Mapping[str, float], before: Sequence[CameraSetting]) -> None:
         """Compare a focus that was to be changed with that of before its first change."""
         if "focus" not in wanted:
             return
         had = next((one.value for one in before if one.name == "focus"), None)
-        now = next((one.value for one in self._told(name)[0] if one.name == "focus"), None)
+        now = next((one.value for one in self._read(name)[0] if one.name == "focus"), None)
         former = self._refocused.get(name)
         calibrated = former.calibrated if former is not None else had
         others = {key: one for key, one in self._refocused.items() if key != name}
@@ -138,22 +150,23 @@ class _Refocused:
     since_s: float
 
 
-def _believed(one: object, camera: str) -> CameraSetting:
-    """A driver's word on a setting, its numbers as Python's own. Raises BadReply for what cannot be."""
+def _checked(one: object, camera: str) -> CameraSetting:
+    """What a driver states of a setting, its numbers as Python's own. Raises BadReply for what cannot be."""
     if not isinstance(one, CameraSetting) or one.name not in SETTINGS:
-        words = f"settings returned {getattr(one, 'name', type(one).__name__)!r}"
-        raise BadReply(f"{words} where one of {', '.join(SETTINGS)} is expected", device=camera)
+        name = getattr(one, "name", type(one).__name__)
+        expected = f"where one of {', '.join(SETTINGS)} is expected"
+        raise BadReply(f"settings returned {name!r} {expected}", device=camera)
     found: dict[str, Any] = {}
     for key, is_right, expected in _RIGHT:
         found[key] = value = getattr(one, key)
         if not is_right(value):
-            words = f"settings returned {one.name} with {key} {value!r}"
-            raise BadReply(f"{words} where {expected} is expected", device=camera)
+            message = f"settings returned {one.name} with {key} {value!r} where {expected} is expected"
+            raise BadReply(message, device=camera)
         if _is_number(value):
             found[key] = float(value)
     if found["minimum"] > found["maximum"]:
-        words = f"settings returned {one.name} with minimum {one.minimum:g} above maximum {one.maximum:g}"
-        raise BadReply(words, device=camera)
+        bounds = f"minimum {one.minimum:g} above maximum {one.maximum:g}"
+        raise BadReply(f"settings returned {one.name} with {bounds}", device=camera)
     return CameraSetting(one.name, **found)
 
 
@@ -187,69 +200,14 @@ def check_wanted(
     found: dict[str, float] = {}
     for name, value in wanted.items():
         if name not in has:
-            words = f"it has {', '.join(has)}" if has else "nothing of it can be changed while it runs"
-            raise BadSetting(f"it has no {name}; {words}", device=camera)
+            known_ones = f"it has {', '.join(has)}" if has else "nothing of it can be changed while it runs"
+            raise BadSetting(f"it has no {name}; {known_ones}", device=camera)
         one, unit = has[name], SETTINGS[name] and f" {SETTINGS[name]}"
         if one.refusal:
             raise BadSetting(f"{name} {one.refusal}", device=camera)
         low, high = f"{one.minimum:g}", f"{one.maximum:g}"
         if not min(float(low), one.minimum) <= value <= max(float(high), one.maximum):
-            words = f"{name} is to be {value:g}{unit}, {low} to {high}{unit} is expected"
-            raise BadSetting(words, device=camera)
+            message = f"{name} is to be {value:g}{unit}, {low} to {high}{unit} is expected"
+            raise BadSetting(message, device=camera)
         found[name] = min(max(value, one.minimum), one.maximum)
     return found
-
-
-class ExposureHold:
-    """One hold of one camera's exposure and settings.
-
-    Both ends are queued in the camera's own thread, and no caller waits for them. The beginning comes before
-    every picture that is asked for after it, the end after the beginning, however late that is. So a camera
-    that hangs or refuses keeps no operation waiting; its fault says so.
-
-    Parameters
-    ----------
-    thread
-        The camera's own thread.
-    camera
-        Returns the camera; one that has no exposure to hold is left alone.
-    count
-        Takes, in that thread, 1 for the beginning and -1 for its end.
-    """
-
-    def __init__(
-        self, thread: DeviceThread, camera: Callable[[], Camera], count: Callable[[int], None]
-    ) -> None:
-        self._thread = thread
-        self._camera = camera
-        self._count = count
-        self._holds = 0
-        self._context: AbstractContextManager[None] | None = None
-
-    def begin(self) -> bool:
-        """Ask for the hold; return whether there is something to `end`."""
-        try:
-            self._thread.submit("hold_exposure", self._enter, HOLD_TIMEOUT_S)
-        except DriverError:  # overdue or closed: its fault says so already, and it takes no pictures
-            return False
-        return True
-
-    def end(self) -> None:
-        """Ask for the release."""
-        try:
-            self._thread.submit("release_exposure", self._leave, HOLD_TIMEOUT_S, anyway=True)
-        except DriverError:  # closed, and with it the camera
-            return
-
-    def _enter(self) -> None:
-        self._holds = 1
-        self._count(1)
-        context = self._camera().exposure_held()
-        context.__enter__()
-        self._context = context
-
-    def _leave(self) -> None:
-        self._count(-self._holds)
-        self._holds = 0
-        if self._context is not None:
-            self._context.__exit__(None, None, None)

@@ -1,9 +1,9 @@
-"""The devices as the service uses them: one owner thread each, answers checked, the one door for moves.
+"""The devices as the service uses them: one owner thread each, answers checked, one judge of all moves.
 
 Every call blocks for a bounded time and may come from any thread. The head is read all the time (50 times a
 second while it moves, 20 while it rests), so that each frame gets the joint angles at its mid-exposure.
 This module does not decide where to point, and an answer that cannot be true is an error. Only a reading,
-which moves nothing, is asked for once more: no operation ends because one answer was lost on the line.
+which moves nothing, is tried once more: no operation ends because one answer was lost on the line.
 """
 
 from __future__ import annotations
@@ -11,34 +11,26 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
-from calib.geometry.mode import SensorMode
 from calib.geometry.rig import JointErrors, Rig
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import BadReply, DriverError, LineLost, NoReply
-from drivers.interfaces import (
-    COARSE_COUNT_RAD,
-    AxisReport,
-    Camera,
-    CameraSetting,
-    PanTilt,
-)
+from drivers.interfaces import COARSE_COUNT_RAD, AxisReport, Camera, PanTilt
 from drivers.options import is_number
 from mastctl.control.machine import StateMachine
 from mastctl.control.standing import StandingFault
 from mastctl.devices import joint_history
 from mastctl.devices.cameras import Cameras
-from mastctl.devices.fault_watch import FaultWatch, FaultWords
-from mastctl.devices.frames import ASKED, KEPT_FRAMES, FrameStore, StampedFrame, check_known
+from mastctl.devices.fault_watch import FaultWatch
+from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.devices.joint_history import HeadReading, JointHistory
 from mastctl.devices.judge import REST_S, KeepOutJudge
 from mastctl.devices.keep_out import Pair
 from mastctl.devices.limits import Limits, SunDirection
 from mastctl.devices.stops import AT_ONCE_S, PATIENCE_S, StopRequests
-from mastctl.devices.thread import DeviceThread
+from mastctl.devices.thread import CallFault, DeviceThread
 from mastctl.errors import MastctlError, Stopped
 
 log = logging.getLogger(__name__)
@@ -47,16 +39,17 @@ HEAD = "pan_tilt"
 READ_TIMEOUT_S = 1.0
 MOVE_TIMEOUT_S = 1.0
 STOP_TIMEOUT_S = 1.0
+CLOSE_S = 2.0
 MOVING_PERIOD_S = 0.02
 RESTING_PERIOD_S = 0.05
-WORDS = {
-    "read": FaultWords("the head is read again"),
-    "move": FaultWords("a later move is taken in time", late_is_fault=True),
+FAULTS = {
+    "read": CallFault("the head is read again"),
+    "move": CallFault("a later move is taken in time", late_is_fault=True),
 }
 
 
 class HardwareLike(Protocol):
-    """What `drivers.open_hardware` gives, as far as it is used here."""
+    """What `drivers.open_hardware` returns, as far as it is used here."""
 
     @property
     def pan_tilt(self) -> PanTilt: ...
@@ -64,7 +57,7 @@ class HardwareLike(Protocol):
     def cameras(self) -> Mapping[str, Camera]: ...
 
 
-class Devices:
+class Devices(Cameras):
     """The head and the cameras behind their threads.
 
     Parameters
@@ -79,30 +72,29 @@ class Devices:
         Stamps are judged against it; deadlines run on it too, or in real time if it is turned by hand.
     rig
         The mast file's content: image sizes, and which cameras ride on the head. Without it sizes are
-        not checked and no camera is taken for frozen.
+        not checked and no camera is declared frozen.
     camera_grace_s
         How long past its time a camera may take before it counts as hanging, seconds; 3 by default.
     new_run
         As in `mastctl.devices.frames.FrameStore`.
     sun
-        What the head cameras must not look into at first.
+        What the head cameras must not see at first.
     machine
-        Is told whether the head moves and what is wrong with it; its publisher gets each reading, each
-        frame's facts and each device's faults. One of its own by default.
+        Gets whether the head moves and what is wrong with it; its publisher each reading, each frame's facts
+        and each device's faults. One of its own by default.
 
     Attributes
     ----------
     on_turn
         Called in the head's own thread each time it is about to read, whatever comes of that; must not wait.
-    door
-        What judges the moves: ways round the keep-outs are asked there, and the sun is told there.
+    judge
+        What judges the moves, by limits, keep-outs and the sun.
     fault_watch
-        Tells each change of what is wrong; what the daemon knows of its own files is told there too.
+        Publishes each change of what is wrong; of the daemon's own files too.
+    temperatures_c
+        Of the axes, replaced and never edited.
 
-    Raises
-    ------
-    BadOptions
-        If the head says that it speeds up faster than the limits allow.
+    Raises BadOptions if the head says that it speeds up faster than the limits allow.
     """
 
     def __init__(
@@ -121,40 +113,29 @@ class Devices:
         self._publisher = self._machine.publisher
         self.on_turn: Callable[[], None] = lambda: None
         self._pan_tilt = hardware.pan_tilt
-        self.door = KeepOutJudge(limits, hardware.pan_tilt, clock, HEAD, rig, sun)
-        self._clock = clock
-        self._time = deadlines_on(clock)
+        self.judge = KeepOutJudge(limits, hardware.pan_tilt, clock, HEAD, rig, sun)
+        deadlines = deadlines_on(clock)
         self._joints = JointErrors() if rig is None else rig.joints
-        self._history = JointHistory(self._joints)
-        self._store = FrameStore(mast_digest, new_run=new_run, on_new=self._new_frame)
+        history = JointHistory(self._joints)
+        store = FrameStore(mast_digest, new_run=new_run, on_new=self._new_frame)
         self._gate = threading.Lock()
-        self._blocks: dict[object, Stopped] = {}  # who lets no move out, and why
+        self._blocks: dict[object, Stopped] = {}  # why no move is let out, by holder
         self._closed = False
-        self.temperatures_c: Mapping[str, float] = {}  # of the axes, replaced and never edited
+        self.temperatures_c: Mapping[str, float] = {}
         self._reported_s: Mapping[str, float] = {}  # what the head reports about itself, and since when
         # The last move's ticket and when it was taken, until the head was read at rest after it.
         self._moved: tuple[int, float] | None = None
         self._stop_lost = False  # a lost line kept a stop from the head, which was not read at rest since
-        self._cameras = Cameras(
-            hardware.cameras,
-            self._store,
-            self._history,
-            self.read,
-            HEAD,
-            clock,
-            self._time,
-            rig,
-            camera_grace_s,
+        super().__init__(
+            hardware.cameras, store, history, self.read, HEAD, clock, deadlines, rig, camera_grace_s
         )
-        self.fault_watch = FaultWatch(self._faults, HEAD, self._machine, self._time)
+        self.fault_watch = FaultWatch(self._faults, HEAD, self._machine, deadlines)
         self._head = DeviceThread(
-            HEAD, between=self._poll, between_timeout_s=READ_TIMEOUT_S, words=WORDS, clock=self._time
+            HEAD, between=self._poll, between_timeout_s=READ_TIMEOUT_S, faults=FAULTS, clock=deadlines
         )
         patience_s = AT_ONCE_S if self._pan_tilt.info.stops_beside is True else PATIENCE_S
-        self._stops = StopRequests(self._head, HEAD, lambda: self._pan_tilt.stop(), self._time, patience_s)
+        self._stops = StopRequests(self._head, HEAD, lambda: self._pan_tilt.stop(), deadlines, patience_s)
         self.fault_watch.begin()
-
-    # The head
 
     @property
     def last_reading(self) -> HeadReading | None:
@@ -162,13 +143,10 @@ class Devices:
         return self._history.newest
 
     def read(self) -> HeadReading:
-        """Return the joint state measured now; what was not answered properly is asked for once more.
+        """Return the joint state measured now; what was not answered properly is tried once more.
 
-        Raises
-        ------
-        NoReply, BadReply, DriverError
-            If the head does not answer in 1 s, both questions together, or answers what cannot be true. The
-            error is that of the first question.
+        Raises NoReply, BadReply, DriverError if the head does not answer in 1 s, both tries together, or
+        answers what cannot be true. The error is that of the first try.
         """
         until_s = self._time.now_s() + READ_TIMEOUT_S
         try:
@@ -183,14 +161,11 @@ class Devices:
                 raise error from None
 
     def report(self) -> Mapping[str, AxisReport]:
-        """Return where each axis was sent and stands in counts; empty for a head that does not know.
+        """Return where each axis was sent and is in counts; empty for a head that does not know.
 
-        Raises
-        ------
-        NoReply, BadReply, DriverError
-            If the head does not tell within 1 s, or tells something else.
+        Raises DriverError if the head does not answer within 1 s, or something else.
         """
-        return self._head.call("report", self._reported, READ_TIMEOUT_S, told=False)
+        return self._head.call("report", self._reported, READ_TIMEOUT_S, noted=False)
 
     @property
     def reading_sigma_rad(self) -> Pair:
@@ -201,30 +176,23 @@ class Devices:
     @property
     def counts_rad(self) -> Mapping[str, float]:
         """One count of ``pan`` and of ``tilt``, as far as the head says it."""
-        return self.door.counts_rad
+        return self.judge.counts_rad
 
-    def goal(self, true_rad: Pair, here: HeadReading) -> Pair:
-        """Return the readings to send the head to, so that it comes to true angles.
+    def goal(self, true_rad: Pair, start: HeadReading) -> Pair:
+        """Return the readings to send a head to that rests at ``start``, so that it comes to true angles.
 
-        By the mast file's joints. The side from which each axis will come follows from where it stands, and
-        from whether the head comes to its goals from one side by itself. Nearer than half the play to where
-        that side changes no goal leads to the angle: the one returned leads past it, by the play at most.
-
-        Parameters
-        ----------
-        true_rad
-            (pan, tilt) wanted.
-        here
-            Where the head rests.
+        By the mast file's joints. The side from which each axis will come follows from where it is, and from
+        whether the head comes to its goals from one side by itself. Nearer than half the play to where that
+        side changes no goal leads to the angle: the one returned leads past it, by the play at most.
         """
         pan, tilt = (
             joint.goal_rad(wanted, read, came, turn)
             for joint, wanted, read, came, turn in zip(
                 (self._joints.pan, self._joints.tilt),
                 true_rad,
-                (here.pan_rad, here.tilt_rad),
-                here.approach,
-                self.door.turns_to(self._joints.read_rad(true_rad)),
+                (start.pan_rad, start.tilt_rad),
+                start.approach,
+                self.judge.turns_to(self._joints.read_rad(true_rad)),
                 strict=True,
             )
         )
@@ -233,16 +201,10 @@ class Devices:
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         """Start the head towards angles that it is to read, radians, and return; at most at the speed cap.
 
-        Raises
-        ------
-        OutsideLimits, KeptOut
-            If an angle or the speed may not be commanded, or the head might pass a keep-out on its way;
-            nothing was sent.
-        Stopped
-            If a stop came first, moves are blocked, or a stop has not come back from the driver yet;
-            nothing was sent.
-        NoReply, DriverError
-            If the head does not take the command in 1 s.
+        Raises OutsideLimits, KeptOut if an angle or the speed may not be commanded, or the head might pass a
+        keep-out on its way; Stopped if a stop came first, moves are blocked, or a stop has not come back from
+        the driver yet; nothing was sent then. Raises NoReply, DriverError if the head does not take the
+        command in 1 s.
         """
         ticket = self._stops.ticket()
         goal = float(pan_rad), float(tilt_rad)
@@ -256,29 +218,26 @@ class Devices:
 
         def send() -> None:
             check_free()
-            self.door.limits.check(*goal)
-            speed = self.door.limits.speed(speed_rad_per_s)
-            start = self.door.check_move(goal, self._read_for_move)
+            self.judge.limits.check(*goal)
+            speed = self.judge.limits.speed(speed_rad_per_s)
+            start = self.judge.check_move(goal, self._read_for_move)
             check_free()  # the head may have been read meanwhile
             self._history.move_sent(self._clock.now_s())
-            self.door.sent(start, goal, speed)
+            self.judge.sent(start, goal, speed)
             self._pan_tilt.move(*goal, speed)
             self._moved = ticket, self._time.now_s()
 
         self._head.call("move", send, MOVE_TIMEOUT_S)
 
-    def check_from(self, here: Pair, goal: Pair) -> None:
+    def check_from(self, start: Pair, goal: Pair) -> None:
         """Pass a goal that may be commanded from a place (`KeepOutJudge.check_from`)."""
-        self.door.check_from(here, goal)
+        self.judge.check_from(start, goal)
 
     def stop(self) -> None:
         """Halt the head at once, whatever hangs (`mastctl.devices.stops`); moves still waiting are never
         sent.
 
-        Raises
-        ------
-        NoReply, DriverError
-            If the head did not confirm within 1 s; it may still move.
+        Raises NoReply, DriverError if the head did not confirm within 1 s; it may still move.
         """
         try:
             self._stops.send(STOP_TIMEOUT_S)
@@ -295,7 +254,7 @@ class Devices:
     def block_moves(self, holder: object, reason: str | Stopped) -> None:
         """Refuse every further move until the holder (any key) allows them again.
 
-        ``reason`` are the words, or the refusal itself, which is then told before those of others.
+        ``reason`` is a sentence, or the refusal itself, which then comes before those of others.
         """
         with self._gate:
             others = {other: why for other, why in self._blocks.items() if other is not holder}
@@ -305,67 +264,17 @@ class Devices:
                 self._blocks = {**others, holder: Stopped(reason)}
 
     def allow_moves(self, holder: object) -> None:
-        """Take back what this holder blocked; moves are taken when nobody blocks them."""
+        """Take back what this holder blocked; moves go out when none is left."""
         with self._gate:
             self._blocks.pop(holder, None)
 
-    # The cameras
-
-    def frames(
-        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float
-    ) -> dict[str, StampedFrame]:
-        """Return one frame of each camera, with its facts; see `mastctl.devices.cameras.Cameras.frames`."""
-        return self._cameras.frames(cameras, exposed_after_s, timeout_s)
-
-    def glance(
-        self, camera: str, exposed_after_s: float, max_age_s: float, timeout_s: float, told: bool = False
-    ) -> StampedFrame:
-        """Return a frame for who only watches; see `mastctl.devices.cameras.Cameras.glance`."""
-        return self._cameras.glance(camera, exposed_after_s, max_age_s, timeout_s, told)
-
-    def frame_by_id(self, frame_id: str, max_age_s: float | None = None) -> StampedFrame:
-        """Return a frame that is still kept. Raises NotKnown, NoLonger, NotNow."""
-        return self._cameras.frame_by_id(frame_id, max_age_s)
-
-    def hold(self, frame: StampedFrame, by: str = ASKED, kept: int = KEPT_FRAMES) -> None:
-        """Keep a frame for who looks at it, as `mastctl.devices.frames.FrameStore.hold`."""
-        self._cameras.hold(frame, by, kept)
-
-    def let_go(self, by: str) -> None:
-        """Hold nothing more for somebody."""
-        self._cameras.let_go(by)
-
-    def newest_frames(self) -> dict[str, StampedFrame | None]:
-        """Return each configured camera's newest frame, None where there is none yet; asks no camera."""
-        return self._cameras.newest_frames()
-
-    def exposure_held(self) -> AbstractContextManager[None]:
-        """Return a context in which every camera keeps its exposure, for a measurement."""
-        return self._cameras.exposure_held()
-
-    def camera_settings(self, camera: str) -> tuple[list[CameraSetting], bool]:
-        """Return what a camera is set to, as `mastctl.devices.camera_settings.CameraControls.told`."""
-        check_known(camera, self._cameras.newest_frames())
-        return self._cameras.settings.told(camera)
-
-    @property
-    def sensor_modes(self) -> Mapping[str, SensorMode]:
-        """Which pixels of its sensor each camera's pictures show, of those that are open and know it."""
-        return self._cameras.sensor_modes
-
-    def set_camera(self, camera: str, wanted: Mapping[str, float]) -> list[str]:
-        """Change it, as `mastctl.devices.camera_settings.CameraControls.change`."""
-        check_known(camera, self._cameras.newest_frames())
-        return self._cameras.settings.change(camera, wanted)
-
-    # All
-
     def use_rig(self, rig: Rig, mast_digest: str) -> None:
         """Stamp frames with another mast file from now on, and forget those that were stamped before."""
-        self._cameras.use_rig(rig)
+        self._calibrated = dict(rig.cameras)
+        self.settings.calibrated()
         self._joints = rig.joints
         self._history.use_joints(rig.joints)
-        self.door.use_rig(rig)
+        self.judge.use_rig(rig)
         self._store.change_mast(mast_digest)
 
     def faults(self) -> tuple[StandingFault, ...]:
@@ -375,20 +284,16 @@ class Devices:
 
     def _faults(self) -> tuple[StandingFault, ...]:
         reported = [
-            StandingFault(HEAD, "device_fault", f"{HEAD}: {word}", since_s, "the head no longer reports it")
-            for word, since_s in self._reported_s.items()
+            StandingFault(HEAD, "device_fault", f"{HEAD}: {fault}", since_s, "the head no longer reports it")
+            for fault, since_s in self._reported_s.items()
         ]
-        door = self.door.faults(self._history.newest)
-        return (*self._head.faults(), *self._stops.faults(), *reported, *door, *self._cameras.faults())
+        judged = self.judge.faults(self._history.newest)
+        return (*self._head.faults(), *self._stops.faults(), *reported, *judged, *self.camera_faults())
 
     def errors(self) -> dict[tuple[str, str, str], int]:
         """Return how often calls have failed since the start: by device, call, and the error's code."""
-        head = {(HEAD, *kind): count for kind, count in self._head.errors().items()}
-        return head | self._cameras.errors()
-
-    def frame_counts(self) -> dict[str, tuple[int, int]]:
-        """Return how many frames were received and missed, of each camera whose driver counts them."""
-        return self._cameras.counts()
+        threads = {HEAD: self._head, **self._threads}
+        return {(name, *kind): count for name, one in threads.items() for kind, count in one.errors().items()}
 
     def close(self) -> None:
         """Stop the head and end the threads; takes some 4 s at most and never raises."""
@@ -401,12 +306,12 @@ class Devices:
             self.stop()
         except (DriverError, MastctlError) as error:
             log.error("the head did not confirm the last stop: %s", error)
-        until_s = self._time.now_s() + 2.0
-        self._head.close(max(0.1, until_s - self._time.now_s()))
-        self._cameras.close(until_s)
+        until_s = self._time.now_s() + CLOSE_S
+        self._head.close(CLOSE_S)
+        self.close_cameras(until_s)
         self.fault_watch.close()
 
-    # In the devices' own threads
+    # In the head's own thread
 
     def _read_for_move(self) -> HeadReading:
         try:
@@ -423,19 +328,17 @@ class Devices:
         reading = self._history.add(checked)
         if set(reading.faults) != set(self._reported_s):
             before_s = self._reported_s
-            self._reported_s = {word: before_s.get(word, reading.time_s) for word in reading.faults}
+            self._reported_s = {fault: before_s.get(fault, reading.time_s) for fault in reading.faults}
             log.warning("%s reports: %s", HEAD, "; ".join(reading.faults) or "healthy again")
-        if self._stop_lost and not reading.moving:
-            self._stop_lost = False
-            self._stops.rests()
-        if self._moved is not None and not reading.moving:
-            ticket, moved_s = self._moved
-            if self._time.now_s() - moved_s > REST_S:
-                self._moved = None
+        if not reading.moving:
+            if self._stop_lost:
+                self._stop_lost = False
+                self._stops.rests()
+            if self._moved is not None and self._time.now_s() - self._moved[1] > REST_S:
+                ticket, self._moved = self._moved[0], None
                 self._stops.proved(ticket)
         self._machine.head_read(reading.moving)
         self._publisher.publish("joints", HEAD, reading)
-        self.fault_watch.look()
         return reading
 
     def _new_frame(self, frame: StampedFrame) -> None:
@@ -445,18 +348,17 @@ class Devices:
         self.on_turn()
         moving = self._read_once().moving
         try:
-            told = self._reported()
+            axes = self._reported()
         except Exception:  # of a driver from outside; the reading is good all the same
-            told = {}
-        warm = {name: axis.temperature_C for name, axis in told.items()}
+            axes = {}
+        warm = {name: axis.temperature_C for name, axis in axes.items()}
         self.temperatures_c = {name: value for name, value in warm.items() if is_number(value)}
         return MOVING_PERIOD_S if moving else RESTING_PERIOD_S
 
     def _reported(self) -> Mapping[str, AxisReport]:
-        head = self._pan_tilt
-        reports = dict(head.report())
+        reports = dict(self._pan_tilt.report())
         for axis in reports.values():
             if not isinstance(axis, AxisReport):
-                words = f"report returned {type(axis).__name__} where an AxisReport is expected"
-                raise BadReply(words, device=HEAD)
+                message = f"report returned {type(axis).__name__} where an AxisReport is expected"
+                raise BadReply(message, device=HEAD)
         return reports

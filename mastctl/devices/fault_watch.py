@@ -1,50 +1,23 @@
-"""What is wrong with the devices: how a failed call becomes a fault, and each change of it told once."""
+"""What is wrong with the devices: each change of it published once."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 from drivers.clock import Clock
 from mastctl.control.machine import StateMachine
 from mastctl.control.standing import StandingFault, same_faults
 
-
-@dataclass(frozen=True)
-class FaultWords:
-    """What belongs to the faults of one kind of call.
-
-    Attributes
-    ----------
-    until
-        What takes such a fault back, in plain words that follow "until".
-    late_is_fault
-        Whether an answer that came too late is a fault itself, because the call moves something; any other
-        answer, however late, shows that the device works again.
-    """
-
-    until: str
-    late_is_fault: bool = False
-
-
 ENDS_S = 1.0
-LOOK_S = 0.1  # a call is overdue by the clock alone; so late it may be told
+LOOK_S = 0.1  # a call is overdue by the clock alone; so late that may show
 
 
 class FaultWatch:
-    """Tells the machine what is wrong with the head, and publishes what is wrong with each device or file.
+    """Publishes what is wrong with each device or file, and informs the machine of the head's faults.
 
-    Parameters
-    ----------
-    faults
-        Returns what is wrong with any device now; must not wait, nor may what `also` is given.
-    head
-        The name under which the head's faults stand.
-    machine
-        Is told of the head's; its publisher gets them all, as ``("fault", device, tuple)``.
-    clock
-        What the looks run on.
+    ``faults`` returns what is wrong with any device now; it must not wait, nor may what `also` gets. Each
+    change is published as ``("fault", device, tuple)``.
     """
 
     def __init__(
@@ -53,23 +26,23 @@ class FaultWatch:
         self._sources: tuple[Callable[[], Sequence[StandingFault]], ...] = (faults,)
         self._head = head
         self._machine = machine
-        self._told: dict[str, tuple[StandingFault, ...]] = {}
+        self._published: dict[str, tuple[StandingFault, ...]] = {}
         self._lock = threading.Lock()
         self._changed = clock.signal()
         self._begun = self._closed = False
         self._thread = clock.thread(self._work, "faults")
 
     def also(self, faults: Callable[[], Sequence[StandingFault]]) -> None:
-        """Look at what else may be wrong from now on: the daemon's own files."""
+        """Watch another source from now on: the daemon's own files."""
         self._sources = (*self._sources, faults)
 
     def now(self) -> tuple[StandingFault, ...]:
-        """Return all that is wrong now, and tell what has changed."""
+        """Return all that is wrong now, and publish what has changed."""
         self.look()
         return tuple(fault for faults in self._sources for fault in faults())
 
     def begin(self) -> None:
-        """Look from now on: ``faults`` can be asked."""
+        """Watch from now on: ``faults`` can be called."""
         self._begun = True
         self._thread.start()
 
@@ -102,11 +75,11 @@ class FaultWatch:
         by_device: dict[str, list[StandingFault]] = {}
         for fault in (one for faults in self._sources for one in faults()):
             by_device.setdefault(fault.device, []).append(fault)
-        for device in {*self._told, *by_device}:
+        for device in {*self._published, *by_device}:
             now = tuple(by_device.get(device, ()))
-            if same_faults(now, self._told.get(device, ())):
+            if same_faults(now, self._published.get(device, ())):
                 continue
-            self._told[device] = now
+            self._published[device] = now
             self._machine.publisher.publish("fault", device, now)
             if device == self._head:
                 self._machine.head_faults(now)

@@ -1,8 +1,8 @@
-"""Frames with their facts: what a picture shows is worth little without when, where and by which mast file.
+"""Frames with their facts: what an image shows is worth little without when, where and by which mast file.
 
 A frame's id is ``<camera>-<sequence>-<mast>-<run>``: the last two are the first 8 digits of the mast file's
 digest and a token of this run of the camera, so that an id kept from yesterday, or from before the mast
-file changed, never names another picture. Clients take ids as opaque.
+file changed, never names another image. Clients take ids as opaque.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from mastctl.frame_facts import FrameFacts
 
 _FRAME_ID = re.compile(r"(.{1,100})-([0-9]{6,20})-([0-9a-f]{8})-([0-9a-f]{4})", re.ASCII)
 KEPT_FRAMES = 16  # per camera; six cameras of 1024x768 grey are 75 MB
-ASKED = "asked"  # who was given a frame by name: a snapshot, a click
-OPERATIONS = "operations"  # who holds the pictures that pointings end with
-WATCHED_BYTES = 256_000_000  # of the frames of all others, who only watch, each frame counted once
-MOST_TOLD = 1024  # more than are kept of all cameras
+REQUESTED = "requested"  # the holder of frames that were given by name: to a snapshot, a click
+OPERATIONS = "operations"  # the holder of the images that pointings end with
+WATCHED_BYTES = 256_000_000  # of the frames of all other holders, which only watch, each frame counted once
+MOST_PUBLISHED = 1024  # more than are kept of all cameras
 CLOCK_TOLERANCE_S = 0.005  # what a stamp may lie in the future: rounding, and a driver that estimates
-DARK_GREY = 8  # a picture whose brightest hundredth is below this shows nothing to correlate with
+DARK_GREY = 8  # an image whose brightest hundredth is below this shows nothing to correlate with
 SATURATED_GREY = 250  # nor does one whose darkest hundredth is above this
 
 
 @dataclass(frozen=True, eq=False)
 class StampedFrame(FrameFacts):
-    """One picture and its facts; the image is uint8 (h, w) or (h, w, 3) BGR, read-only.
+    """One image and its facts; it is uint8 (h, w) or (h, w, 3) BGR, read-only.
 
     ``jpeg`` is the camera's own that it was made of; empty where there is none.
     """
@@ -45,7 +45,7 @@ class StampedFrame(FrameFacts):
 
     @property
     def facts(self) -> FrameFacts:
-        """The facts without the picture."""
+        """The facts without the image."""
         return FrameFacts(**{one.name: getattr(self, one.name) for one in fields(FrameFacts)})
 
     @property
@@ -58,20 +58,20 @@ def check_known(camera: str, configured: Iterable[str]) -> None:
     """Pass the name of a configured camera. Raises NotKnown ``unknown_camera``."""
     known = sorted(configured)
     if camera not in known:
-        words = f"camera {camera[:80]} is not configured; configured are {', '.join(known) or 'none'}"
-        raise NotKnown("unknown_camera", words)
+        message = f"camera {camera[:80]} is not configured; configured are {', '.join(known) or 'none'}"
+        raise NotKnown("unknown_camera", message)
 
 
 def check_size(camera: str, size_px: tuple[int, int], wanted_px: tuple[int, int]) -> None:
-    """Raise BadFrame if a camera's pictures, (width, height), are not of the mast file's size."""
+    """Raise BadFrame if a camera's images, (width, height), are not of the mast file's size."""
     if size_px != wanted_px:
-        words = "the image is {}x{} px where the mast file has {}x{} px".format(*size_px, *wanted_px)
+        message = "the image is {}x{} px where the mast file has {}x{} px".format(*size_px, *wanted_px)
         remedy = "for a crop or binning of the calibrated picture 'mastctl camera mode' writes a mast file"
-        raise BadFrame(f"{words}; {remedy}", device=camera)
+        raise BadFrame(f"{message}; {remedy}", device=camera)
 
 
 def check_mode(camera: str, now: SensorMode, then: SensorMode) -> None:
-    """Raise BadFrame if a camera's pictures are not of the sensor mode that the mast file was calibrated in.
+    """Raise BadFrame if a camera's images are not of the sensor mode that the mast file was calibrated in.
 
     A crop that either lacks is not compared, and their sizes have to be equal.
     """
@@ -85,37 +85,26 @@ def check_mode(camera: str, now: SensorMode, then: SensorMode) -> None:
         if not str(change):
             return
         given = ((" --crop {} {} {} {}", change.crop_px), (" --bin {} {}", change.binning))
-        options = "".join(words.format(*value) for words, value in given if value not in (None, (1, 1)))
+        options = "".join(option.format(*value) for option, value in given if value not in (None, (1, 1)))
         options += f" --flip {flip_name(change.flip)}" if any(change.flip) else ""
         remedy = (
             f"'mastctl camera mode MAST.yaml --camera {camera}{options} --out NEW.yaml' writes its mast file"
         )
         if change.binning != (1, 1):
             remedy += "; a camera that skips pixels and does not bin them has to be calibrated as it is"
-    words = f"its pictures show {now} where cameras.{camera}.sensor_mode of the mast file has"
-    raise BadFrame(f"{words} {then}; {remedy}", device=camera)
+    message = f"its pictures show {now} where cameras.{camera}.sensor_mode of the mast file has"
+    raise BadFrame(f"{message} {then}; {remedy}", device=camera)
 
 
 def checked(
     answer: object, camera: str, size_px: tuple[int, int] | None, exposed_after_s: float, now_s: float
 ) -> Frame:
-    """Return a driver's answer to ``next_frame`` if it can be true and was exposed after the asked moment.
+    """Return a driver's answer to ``next_frame`` if it can be true and was exposed after a moment.
 
-    Parameters
-    ----------
-    answer
-        Whatever the driver returned.
-    camera, size_px
-        The camera's name, and (width, height) by the mast file; None if not known.
-    exposed_after_s, now_s
-        The asked moment and the present, seconds of CLOCK_MONOTONIC.
+    ``size_px`` is (width, height) by the mast file, None if not known. Times are of CLOCK_MONOTONIC.
 
-    Raises
-    ------
-    BadFrame
-        If it is no frame, of another size, dark, saturated, or stamped in the future.
-    NoFreshFrame
-        If its exposure began too early.
+    Raises BadFrame if it is no frame, of another size, dark, saturated, or stamped in the future;
+    NoFreshFrame if its exposure began too early.
     """
     try:
         image = answer.image  # type: ignore[attr-defined]
@@ -123,41 +112,43 @@ def checked(
         mid_s = _number(answer.mid_exposure_s)  # type: ignore[attr-defined]
         exposure_s = _number(answer.exposure_s)  # type: ignore[attr-defined]
     except (AttributeError, TypeError, ValueError) as reason:
-        words = f"next_frame returned {type(answer).__name__} that is not a frame: {reason}"
-        raise BadFrame(words, device=camera) from None
+        message = f"next_frame returned {type(answer).__name__} that is not a frame: {reason}"
+        raise BadFrame(message, device=camera) from None
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
         kind = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
         raise BadFrame(f"the image is {kind} where an array of uint8 is expected", device=camera)
     if not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)) or image.size == 0:
-        words = f"the image has shape {image.shape} where (h, w) or (h, w, 3) is expected"
-        raise BadFrame(words, device=camera)
+        message = f"the image has shape {image.shape} where (h, w) or (h, w, 3) is expected"
+        raise BadFrame(message, device=camera)
     if size_px is not None:
         check_size(camera, (image.shape[1], image.shape[0]), size_px)
     if sequence < 0 or exposure_s < 0.0:
-        words = f"sequence {sequence} and exposure {exposure_s} s where neither may be below 0"
-        raise BadFrame(words, device=camera)
+        message = f"sequence {sequence} and exposure {exposure_s} s where neither may be below 0"
+        raise BadFrame(message, device=camera)
     ended_s = mid_s + exposure_s / 2
     if ended_s > now_s + CLOCK_TOLERANCE_S:
-        words = f"the exposure is stamped to end {ended_s - now_s:.3f} s in the future"
-        raise BadFrame(words, device=camera)
+        message = f"the exposure is stamped to end {ended_s - now_s:.3f} s in the future"
+        raise BadFrame(message, device=camera)
     began_s = mid_s - exposure_s / 2
     if began_s <= exposed_after_s:
-        words = f"the frame that came was exposed {exposed_after_s - began_s:.3f} s before the asked moment"
-        raise NoFreshFrame(words, device=camera)
+        message = (
+            f"the frame that came was exposed {exposed_after_s - began_s:.3f} s before the requested moment"
+        )
+        raise NoFreshFrame(message, device=camera)
     darkest, brightest = np.percentile(image[::8, ::8], (1, 99))
     if brightest < DARK_GREY:
-        words = f"the picture is dark: its brightest hundredth is at {brightest:.0f} of 255"
-        raise BadFrame(words, device=camera, detail={"light": "dark"})
+        message = f"the picture is dark: its brightest hundredth is at {brightest:.0f} of 255"
+        raise BadFrame(message, device=camera, detail={"light": "dark"})
     if darkest >= SATURATED_GREY:
-        words = f"the picture is saturated: its darkest hundredth is at {darkest:.0f} of 255"
-        raise BadFrame(f"{words}; expose it for less time", device=camera, detail={"light": "saturated"})
+        message = f"the picture is saturated: its darkest hundredth is at {darkest:.0f} of 255"
+        raise BadFrame(f"{message}; expose it for less time", device=camera, detail={"light": "saturated"})
     if image.flags.writeable or not image.flags.c_contiguous:
         # The driver may use its buffer again; one that hands over a read-only array is spared the copy.
         image = image.copy()
         image.setflags(write=False)
     jpeg = getattr(answer, "jpeg", b"")
-    told = jpeg if isinstance(jpeg, bytes) else b""
-    return Frame(image, sequence, mid_s, exposure_s, jpeg=told, settings=_settings(answer))
+    jpeg = jpeg if isinstance(jpeg, bytes) else b""
+    return Frame(image, sequence, mid_s, exposure_s, jpeg=jpeg, settings=_settings(answer))
 
 
 def random_run() -> str:
@@ -165,30 +156,28 @@ def random_run() -> str:
     return secrets.token_hex(2)
 
 
-Place = tuple[str, str]
+class _Kept:
+    """The frames that holders keep, the newest of each camera, by (holder, camera).
 
-
-class _Held:
-    """The frames that are kept for those who look at them, by place: for whom, and of which camera.
-
-    Of those who only watch the oldest give way beyond ``WATCHED_BYTES`` in all, each frame counted once.
+    Of holders that only watch the oldest give way beyond ``WATCHED_BYTES`` in all, each frame counted once.
     """
 
     def __init__(self) -> None:
-        self._places: dict[Place, OrderedDict[str, StampedFrame]] = {}
-        self._order: OrderedDict[tuple[Place, str], None] = OrderedDict()  # of those who watch
-        self._watched: Counter[str] = Counter()  # how many of them keep a frame
+        self._frames: dict[tuple[str, str], OrderedDict[str, StampedFrame]] = {}
+        self._order: OrderedDict[tuple[tuple[str, str], str], None] = OrderedDict()  # of those that watch
+        self._watchers: Counter[str] = Counter()  # how many of them keep a frame
         self._bytes = 0
 
-    def add(self, place: Place, frame: StampedFrame, most: int) -> None:
-        """Keep a frame as the newest of a place, which has so many."""
-        self._remove(place, frame.frame_id)
-        frames = self._places.setdefault(place, OrderedDict())
-        frames[frame.frame_id] = frame
-        if place[0] not in (ASKED, OPERATIONS):
-            self._order[place, frame.frame_id] = None
-            self._bytes += 0 if self._watched[frame.frame_id] else frame.image.nbytes
-            self._watched[frame.frame_id] += 1
+    def add(self, by: str, frame: StampedFrame, most: int) -> None:
+        """Keep a frame as the newest of its camera, of which a holder has so many."""
+        place, name = (by, frame.camera), frame.frame_id
+        self._remove(place, name)
+        frames = self._frames.setdefault(place, OrderedDict())
+        frames[name] = frame
+        if by not in (REQUESTED, OPERATIONS):
+            self._order[place, name] = None
+            self._bytes += 0 if self._watchers[name] else frame.image.nbytes
+            self._watchers[name] += 1
         while len(frames) > most:
             self._remove(place, next(iter(frames)))
         while self._bytes > WATCHED_BYTES and len(self._order) > 1:
@@ -196,26 +185,26 @@ class _Held:
 
     def get(self, frame_id: str) -> StampedFrame | None:
         """Return a kept frame by its id."""
-        return next((frames[frame_id] for frames in self._places.values() if frame_id in frames), None)
+        return next((frames[frame_id] for frames in self._frames.values() if frame_id in frames), None)
 
-    def drop(self, ends: Callable[[Place], bool]) -> None:
-        """Keep nothing more for some places."""
-        for place in [one for one in self._places if ends(one)]:
-            for frame_id in list(self._places[place]):
+    def drop(self, by: str | None = None, camera: str | None = None) -> None:
+        """Keep nothing more for a holder, or of a camera."""
+        for place in [one for one in self._frames if by == one[0] or camera == one[1]]:
+            for frame_id in list(self._frames[place]):
                 self._remove(place, frame_id)
 
-    def _remove(self, place: Place, frame_id: str) -> None:
-        frames = self._places.get(place)
+    def _remove(self, place: tuple[str, str], frame_id: str) -> None:
+        frames = self._frames.get(place)
         if frames is None or frame_id not in frames:
             return
         frame = frames.pop(frame_id)
         if not frames:
-            del self._places[place]
+            del self._frames[place]
         if (place, frame_id) in self._order:
             del self._order[place, frame_id]
-            self._watched[frame_id] -= 1
-            if not self._watched[frame_id]:
-                del self._watched[frame_id]
+            self._watchers[frame_id] -= 1
+            if not self._watchers[frame_id]:
+                del self._watchers[frame_id]
                 self._bytes -= frame.image.nbytes
 
 
@@ -223,13 +212,12 @@ class FrameStore:
     """The newest frames of each camera, found again by id. Safe to use from any thread.
 
     ``new_run`` makes the last part of ids, four hexadecimal digits; `random_run` by default. ``on_new`` gets
-    each frame that is told of, once; must return at once.
+    each frame that is published, once; must return at once.
     """
 
     def __init__(
         self,
         mast_digest: str,
-        kept: int = KEPT_FRAMES,
         new_run: Callable[[], str] | None = None,
         on_new: Callable[[StampedFrame], None] = lambda frame: None,
     ) -> None:
@@ -237,11 +225,10 @@ class FrameStore:
         self._on_new = on_new
         self._new_run = new_run or random_run
         self._runs: dict[str, str] = {}
-        self._kept = kept
         self._frames: dict[str, deque[StampedFrame]] = {}
-        self._held = _Held()
+        self._kept = _Kept()
         self._newest: Mapping[str, StampedFrame] = {}  # replaced, never edited
-        self._told: deque[str] = deque(maxlen=MOST_TOLD)
+        self._published: deque[str] = deque(maxlen=MOST_PUBLISHED)
         self._lock = threading.Lock()
 
     def name(self, camera: str, sequence: int) -> tuple[str, str]:
@@ -249,8 +236,7 @@ class FrameStore:
         with self._lock:
             if camera not in self._runs:
                 self._runs[camera] = self._new_run()
-            run = self._runs[camera]
-            digest = self._digest
+            run, digest = self._runs[camera], self._digest
         return f"{camera}-{sequence:06d}-{digest[:8]}-{run}", digest
 
     def change_mast(self, mast_digest: str) -> None:
@@ -261,96 +247,79 @@ class FrameStore:
         with self._lock:
             self._digest = mast_digest
             self._frames.clear()
-            self._held = _Held()
+            self._kept = _Kept()
             self._newest = {}
             self._runs.clear()
 
     def begin_again(self, camera: str) -> None:
-        """Forget a camera's frames, because its count went back: one number must not name two pictures."""
+        """Forget a camera's frames, because its count went back: one number must not name two images."""
         with self._lock:
             self._frames.pop(camera, None)
-            self._held.drop(lambda place: place[1] == camera)
+            self._kept.drop(camera=camera)
             self._newest = {name: frame for name, frame in self._newest.items() if name != camera}
             self._runs[camera] = self._new_run()
 
-    def add(self, frame: StampedFrame, told: bool = True) -> StampedFrame:
+    def add(self, frame: StampedFrame, published: bool = True) -> StampedFrame:
         """Keep a frame and return it; if a frame of that id is kept already, that one is returned.
 
-        It is told of unless ``told`` is False: a picture that is only watched need not be recorded.
+        One that is only watched is not ``published``, and so not recorded.
         """
-        kept = self._kept_one(frame)
-        if told:
-            self.tell(kept)
-        return kept
-
-    def tell(self, frame: StampedFrame) -> None:
-        """Tell of a frame that somebody uses, unless it was told of, and hold it."""
-        self._hold(frame, ASKED, self._kept)
         with self._lock:
-            if frame.frame_id in self._told or frame.mast_digest != self._digest:
-                return
-            self._told.append(frame.frame_id)
-        self._on_new(frame)
-
-    def _kept_one(self, frame: StampedFrame) -> StampedFrame:
-        with self._lock:
-            if frame.mast_digest != self._digest:  # the mast file changed while it was on its way
-                return frame
-            frames = self._frames.setdefault(frame.camera, deque(maxlen=self._kept))
-            for known in frames:
-                if known.frame_id == frame.frame_id:
-                    return known
-            frames.append(frame)
-            self._newest = {**self._newest, frame.camera: frame}
+            if frame.mast_digest == self._digest:  # else the mast file changed while it was on its way
+                frames = self._frames.setdefault(frame.camera, deque(maxlen=KEPT_FRAMES))
+                known = next((one for one in frames if one.frame_id == frame.frame_id), None)
+                if known is None:
+                    frames.append(frame)
+                    self._newest = {**self._newest, frame.camera: frame}
+                frame = known or frame
+        if published:
+            self.publish(frame)
         return frame
+
+    def publish(self, frame: StampedFrame) -> None:
+        """Publish a frame that is used, unless it was, and keep it as one that was requested."""
+        with self._lock:
+            if frame.mast_digest != self._digest:
+                return
+            self._kept.add(REQUESTED, frame, KEPT_FRAMES)
+            if frame.frame_id in self._published:
+                return
+            self._published.append(frame.frame_id)
+        self._on_new(frame)
 
     def newest(self, camera: str) -> StampedFrame | None:
         """Return a camera's newest frame, None before the first; takes no lock."""
         return self._newest.get(camera)
 
-    def hold(self, frame: StampedFrame, by: str = ASKED, kept: int = KEPT_FRAMES) -> None:
-        """Keep a frame that somebody looks at, however many come after it: it may be clicked yet.
+    def hold(self, frame: StampedFrame, by: str = REQUESTED, kept: int = KEPT_FRAMES) -> None:
+        """Keep a frame for a holder, however many come after it: it may be clicked yet.
 
-        Parameters
-        ----------
-        frame
-            One of this store.
-        by
-            Who looks; each keeps the newest it held of every camera.
-        kept
-            How many of a camera.
+        Each holder keeps the newest it was given of every camera, ``kept`` at most.
         """
-        if by == ASKED:
-            self.tell(frame)
-        else:
-            self._hold(frame, by, kept)
-
-    def _hold(self, frame: StampedFrame, by: str, kept: int) -> None:
+        if by == REQUESTED:
+            self.publish(frame)
+            return
         with self._lock:
-            if frame.mast_digest != self._digest:
-                return
-            self._held.add((by, frame.camera), frame, kept)
+            if frame.mast_digest == self._digest:
+                self._kept.add(by, frame, kept)
 
     def let_go(self, by: str) -> None:
-        """Hold nothing more for somebody."""
+        """Keep nothing more for a holder."""
         with self._lock:
-            self._held.drop(lambda place: place[0] == by)
+            self._kept.drop(by=by)
 
     def by_id(self, frame_id: str) -> StampedFrame:
         """Return a frame by its id.
 
-        Raises
-        ------
-        NoLonger, NotNow, NotKnown
-            ``frame_too_old`` if it was taken in this run but is no longer kept, ``other_mast_file`` if it
-            was taken with another mast file, ``frame_unknown`` otherwise.
+        Raises NoLonger, NotNow, NotKnown ``frame_too_old`` if it was taken in this run but is no longer kept,
+        ``other_mast_file`` if it was taken with another mast file, ``frame_unknown`` otherwise.
         """
         with self._lock:
             for frames in self._frames.values():
                 for frame in frames:
                     if frame.frame_id == frame_id:
                         return frame
-            if (kept := self._held.get(frame_id)) is not None:
+            if (kept := self._kept.get(frame_id)) is not None:
                 return kept
             newest = {camera: frames[-1].sequence for camera, frames in self._frames.items() if frames}
             runs = dict(self._runs)
@@ -366,7 +335,7 @@ class FrameStore:
             if run == runs.get(camera) and int(sequence) <= newest.get(camera, -1):
                 raise NoLonger(
                     "frame_too_old",
-                    f"frame {frame_id} is no longer kept (the newest {self._kept} of a camera are)",
+                    f"frame {frame_id} is no longer kept (the newest {KEPT_FRAMES} of a camera are)",
                 )
         raise NotKnown("frame_unknown", f"frame {frame_id[:120]} was not taken by this run of the service")
 
@@ -374,10 +343,7 @@ class FrameStore:
 def camera_and_sequence(frame_id: str) -> tuple[str, int]:
     """Return the camera and the sequence number that a frame's id names.
 
-    Raises
-    ------
-    ValueError
-        If it is no frame id.
+    Raises ValueError if it is no frame id.
     """
     named = _FRAME_ID.fullmatch(frame_id)
     if named is None:
@@ -387,12 +353,12 @@ def camera_and_sequence(frame_id: str) -> tuple[str, int]:
 
 def _settings(answer: object) -> dict[str, float | None]:
     """What a driver says that a frame was taken with; None for what is no number."""
-    told = getattr(answer, "settings", None)
+    stated = getattr(answer, "settings", None)
     known: dict[str, float | None] = {}
     for name in SETTINGS:
-        if isinstance(told, Mapping) and name in told:
+        if isinstance(stated, Mapping) and name in stated:
             try:
-                known[name] = _number(told[name])
+                known[name] = _number(stated[name])
             except (TypeError, ValueError):
                 known[name] = None
     return known

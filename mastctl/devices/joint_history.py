@@ -1,7 +1,7 @@
-"""What the head measured lately: checked readings, from which a frame's joint angles are told.
+"""What the head measured lately: checked readings, from which a frame gets its joint angles.
 
 Here read angles become true ones, once: by the mast file's ``joints`` (`calib.geometry.rig`), and by the side
-from which each axis came, which the readings tell. Behind gears with play b the load stands between the
+from which each axis came, which the readings show. Behind gears with play b the load is between the
 reading less b/2 and the reading plus b/2, and stays where it is until one of the two takes it along.
 """
 
@@ -27,37 +27,20 @@ OLDEST_READING_S = 1.0  # a reading stamped further back is not a present measur
 CLOCK_TOLERANCE_S = 0.005  # what a stamp may lie in the future by rounding
 LARGEST_GAP_S = 1.0  # between the readings around an exposure of a head that moves: its angles are a guess
 LARGEST_GAP_AT_REST_S = 10.0  # of one that rests before and after: a late reading is not a fault
-MOST_FAULTS, LONGEST_FAULT = 20, 200  # words that a head may say of itself at once, and their signs
+MOST_FAULTS, LONGEST_FAULT = 20, 200  # what a head may report of itself at once, and how long each may be
 STILL_RAD = 3e-3  # between neighbours; two counts of a 12-bit servo
-USUAL_PLAY_RAD = 6e-3  # of hobby servos' gears; by it the side is told where the mast file states no backlash
+USUAL_PLAY_RAD = 6e-3  # of hobby servos' gears; it shows the side where the mast file states none
 
-Span = tuple[float, float]
-
-
-@dataclass(frozen=True)
-class JointsAtExposure:
-    """Joint angles at mid-exposure as read, radians, the true ones, from which side each axis came, and
-    whether the head moved during the exposure.
-    """
-
-    pan_rad: float
-    tilt_rad: float
-    moving: bool
-    true_rad: Pair
-    approach: Approach
+Interval = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class HeadReading(Reading):
-    """A reading of the head, and where it truly stands.
+    """A reading of the head, and its true angles.
 
-    Attributes
-    ----------
-    true_rad
-        (pan, tilt) by the mast file's joints.
-    approach
-        For pan and tilt, from which side the axis came: 1 from smaller readings, -1 from larger, 0 not known,
-        between them where it has not gone through all of its play since it turned round.
+    ``true_rad``: (pan, tilt) by the mast file's joints; ``approach``: for pan and tilt, from which side the
+    axis came: 1 from smaller readings, -1 from larger, 0 not known, between them where it has not gone
+    through all of its play since it turned round.
     """
 
     true_rad: Pair = field(kw_only=True)
@@ -67,27 +50,17 @@ class HeadReading(Reading):
 def checked(answer: object, device: str, now_s: float, newest_s: float | None) -> Reading:
     """Return a driver's answer to ``read`` as a Reading, if it can be true.
 
-    Parameters
-    ----------
-    answer
-        Whatever the driver returned.
-    device
-        The device's name, for errors.
-    now_s, newest_s
-        The present, and the stamp of the last good reading (None before it), seconds of CLOCK_MONOTONIC.
+    ``newest_s`` is the stamp of the last good reading, None before it; times are of CLOCK_MONOTONIC.
 
-    Raises
-    ------
-    BadReply
-        If it is no reading, an angle is not finite or beyond a full turn, or the stamp lies in the future,
-        more than 1 s back, or before the last one.
+    Raises BadReply if it is no reading, an angle is not finite or beyond a full turn, or the stamp lies in
+    the future, more than 1 s back, or before the last one.
     """
     numbers = {}
     for name in ("pan_rad", "tilt_rad", "time_s"):
         value = getattr(answer, name, None)
         if isinstance(value, (bool, str)) or not isinstance(value, (int, float, np.integer, np.floating)):
-            words = f"read returned {type(answer).__name__} whose {name} is {str(value)[:40]}"
-            raise BadReply(f"{words} where a number is expected", device=device)
+            found = f"read returned {type(answer).__name__} whose {name} is {str(value)[:40]}"
+            raise BadReply(f"{found} where a number is expected", device=device)
         numbers[name] = float(value)
         if not math.isfinite(numbers[name]):
             raise BadReply(f"{name} is {numbers[name]} where a finite number is expected", device=device)
@@ -107,34 +80,34 @@ def checked(answer: object, device: str, now_s: float, newest_s: float | None) -
             f"the reading is {now_s - time_s:.3f} s old, at most {OLDEST_READING_S} s is taken", device=device
         )
     if newest_s is not None and time_s < newest_s:
-        words = f"the reading's time goes back by {newest_s - time_s:.3f} s"
-        raise BadReply(words, device=device)
+        raise BadReply(f"the reading's time goes back by {newest_s - time_s:.3f} s", device=device)
     faults = _faults(getattr(answer, "faults", ()) or (), device)
     return Reading(numbers["pan_rad"], numbers["tilt_rad"], bool(moving), time_s, faults)
 
 
 def _faults(given: object, device: str) -> tuple[str, ...]:
-    """What the head says is wrong with it, each as one line, as many as anybody reads. Raises BadReply."""
+    """What the head reports of itself, each as one line, `MOST_FAULTS` at most. Raises BadReply."""
     if isinstance(given, str):
         given = (given,)
     if not isinstance(given, Iterable):
-        raise BadReply(f"faults is {one_line(given, 40)} where words are expected", device=device)
-    return tuple(one_line(word, LONGEST_FAULT) for word in islice(given, MOST_FAULTS))
+        raise BadReply(f"faults is {one_line(given, 40)} where sentences are expected", device=device)
+    return tuple(one_line(fault, LONGEST_FAULT) for fault in islice(given, MOST_FAULTS))
 
 
 class JointHistory:
     """Readings of the last minute, and when moves were sent. Safe to use from any thread.
 
     A head that says now and then that it moves, although its readings are those of a head at rest
-    (`mastctl.devices.joint_history.dithers`) and no move was sent for a second, is taken to rest.
-
-    ``joints`` are the mast file's: what readings are wrong by.
+    (`dithers`) and no move was sent for a second, is treated as resting. ``joints`` are the mast file's:
+    what readings are wrong by.
     """
 
     def __init__(self, joints: JointErrors | None = None) -> None:
         self._joints = joints or JointErrors()
         self._readings: deque[Reading] = deque(maxlen=KEPT_READINGS)  # as the driver gave them
-        self._loads: deque[tuple[Span, Span]] = deque(maxlen=KEPT_READINGS)  # and where the loads may be then
+        self._loads: deque[tuple[Interval, Interval]] = deque(
+            maxlen=KEPT_READINGS
+        )  # and where the loads may be then
         self._newest: HeadReading | None = None  # with what is true of its motion
         self._moves_s: deque[float] = deque(maxlen=200)
         self._lock = threading.Lock()
@@ -187,18 +160,15 @@ class JointHistory:
         with self._lock:
             self._moves_s.append(time_s)
 
-    def at_exposure(self, began_s: float, mid_s: float, ended_s: float, device: str) -> JointsAtExposure:
-        """Return the joint angles at mid-exposure, linear between the readings around it.
+    def at_exposure(self, began_s: float, mid_s: float, ended_s: float, device: str) -> HeadReading:
+        """Return the head at mid-exposure, linear between the readings around it.
 
         The head counts as moving if a move was sent between the last reading before the exposure and the
         first one after it, if any of them says so, or if these differ by more than 3 mrad; the last two not
         of a head that dithers at rest.
 
-        Raises
-        ------
-        BadReply
-            If the readings do not reach around the exposure, or leave a gap of more than 1 s in it, 10 s at
-            rest.
+        Raises BadReply if the readings do not reach around the exposure, or leave a gap of more than 1 s in
+        it, 10 s at rest.
         """
         with self._lock:
             times_s = [reading.time_s for reading in self._readings]
@@ -225,13 +195,14 @@ class JointHistory:
             LARGEST_GAP_S if moving else LARGEST_GAP_AT_REST_S,
         )
         if gap_s > most_s:
-            words = f"the joint readings around the exposure are {gap_s:.2f} s apart"
-            raise BadReply(f"{words}, at most {most_s:g} s is taken", device=device)
+            gap = f"the joint readings around the exposure are {gap_s:.2f} s apart"
+            raise BadReply(f"{gap}, at most {most_s:g} s is taken", device=device)
         read = float(np.interp(mid_s, stamps_s, pans)), float(np.interp(mid_s, stamps_s, tilts))
         pan_load, tilt_load = (float(np.interp(mid_s, stamps_s, load)) for load in zip(*loads, strict=True))
         with self._lock:
             approach = self._approach(read, (pan_load, tilt_load))
-            return JointsAtExposure(*read, moving, self._joints.true_rad(read, approach), approach)
+            true_rad = self._joints.true_rad(read, approach)
+            return HeadReading(*read, moving, mid_s, true_rad=true_rad, approach=approach)
 
     def _plays_rad(self) -> Pair:
         return (
@@ -240,7 +211,7 @@ class JointHistory:
         )
 
     def _follow(self, reading: Reading) -> None:
-        """Tell where the loads may be once the head stands at a reading; the lock is held."""
+        """Note where the loads may be once the head is at a reading; the lock is kept."""
         pan, tilt = (
             _taken_along(self._loads[-1][axis] if self._loads else None, at, play)
             for axis, (at, play) in enumerate(
@@ -250,7 +221,7 @@ class JointHistory:
         self._loads.append((pan, tilt))
 
     def _approach(self, read: Pair, loads: Pair) -> Approach:
-        """From which side each axis came, by where its load stands; the lock is held."""
+        """From which side each axis came, by where its load is; the lock is kept."""
         pan, tilt = (
             min(max((at - load) / (play / 2), -1.0), 1.0)
             for at, load, play in zip(read, loads, self._plays_rad(), strict=True)
@@ -258,7 +229,7 @@ class JointHistory:
         return round(pan, 6), round(tilt, 6)
 
     def _dithers(self, until_s: float) -> bool:
-        """Whether the readings up to a moment are those of a head that dithers at rest; the lock is held."""
+        """Whether the readings up to a moment are those of a head that dithers at rest; the lock is kept."""
         return any(self._dithers_for(for_s, until_s) for for_s in (DITHER_S, 2 * DITHER_S))
 
     def _dithers_for(self, for_s: float, until_s: float) -> bool:
@@ -274,13 +245,13 @@ class JointHistory:
         return bool(window) and dithers(window[::-1], for_s=for_s)
 
 
-def _taken_along(load: Span | None, read_rad: float, play_rad: float) -> Span:
-    """The lowest and the highest place of a load behind its play; None: nobody knows where it was before."""
+def _taken_along(load: Interval | None, read_rad: float, play_rad: float) -> Interval:
+    """The lowest and the highest place of a load behind its play; None: its place before is not known."""
     low, high = read_rad - play_rad / 2, read_rad + play_rad / 2
     return (low, high) if load is None else (min(max(load[0], low), high), min(max(load[1], low), high))
 
 
-def _middles(loads: tuple[Span, Span]) -> Pair:
+def _middles(loads: tuple[Interval, Interval]) -> Pair:
     pan, tilt = (0.5 * (low + high) for low, high in loads)
     return pan, tilt
 
@@ -295,14 +266,8 @@ QUIET_SHARE = 0.25  # of the readings that must say rest; fewer is a head that s
 def dithers(readings: Sequence[Reading], tolerance_rad: float = DITHER_RAD, for_s: float = DITHER_S) -> bool:
     """Return whether a head rests although its readings flicker, or say now and then that it moves.
 
-    Parameters
-    ----------
-    readings
-        As the driver gave them, oldest first.
-    tolerance_rad
-        How far they may lie from each other, radians.
-    for_s
-        How much of them is looked at, seconds.
+    ``readings`` are as the driver gave them, oldest first, of which the last ``for_s`` seconds count;
+    ``tolerance_rad`` is how far they may lie from each other.
     """
     window = [one for one in readings if one.time_s >= readings[-1].time_s - for_s]
     if len(window) < 8 or window[-1].time_s - window[0].time_s < 0.9 * for_s:
@@ -324,15 +289,11 @@ def dithers(readings: Sequence[Reading], tolerance_rad: float = DITHER_RAD, for_
 class RestWatch:
     """Watches a head's readings, one after the other.
 
-    Parameters
-    ----------
-    dwell_s
-        How long a head that does not dither must be unchanged; at least seven times as long as its last two
-        changes were apart. One that creeps changes by a count now and then, and one that rings stands longer
-        where it turns than before, by up to 2 / (sqrt(2) - 1) = 4.8 times and what the pace of the readings
-        hides.
-    tolerance_rad
-        How far the readings of one that dithers may lie from each other, radians.
+    ``dwell_s``: how long a head that does not dither must be unchanged; at least seven times as long as its
+    last two changes were apart. One that creeps changes by a count now and then, and one that rings stands
+    longer where it turns than before, by up to 2 / (sqrt(2) - 1) = 4.8 times and what the pace of the
+    readings hides. ``tolerance_rad``: how far the readings of one that dithers may lie from each other,
+    radians.
     """
 
     def __init__(self, dwell_s: float, tolerance_rad: float = DITHER_RAD) -> None:
@@ -370,10 +331,10 @@ class RestWatch:
         """Say what the readings of the last second were like."""
         angles_rad = np.array([(one.pan_rad, one.tilt_rad) for one in self._readings])
         pan_rad, tilt_rad = np.ptp(angles_rad, axis=0)
-        said = sum(one.moving for one in self._readings)
+        moving = sum(one.moving for one in self._readings)
         return (
             f"its last {len(self._readings)} readings lie within {pan_rad:.4f} rad in pan and "
-            f"{tilt_rad:.4f} rad in tilt, and {said} of them say that it moves"
+            f"{tilt_rad:.4f} rad in tilt, and {moving} of them say that it moves"
         )
 
 

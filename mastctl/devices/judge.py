@@ -1,6 +1,6 @@
-"""The one door's judgement: which moves may go out, with the limits and keep-outs of this moment.
+"""The judge of moves: which may go out, with the limits and keep-outs of this moment.
 
-Where a head that moves may be is counted, not guessed. It is within the rectangle of the move that was let
+Where a head that moves may be is computed, not guessed. It is within the rectangle of the move that was let
 through last, which is free; and near its reading: as far off as it needs to brake from the fastest speed that
 it was sent with, and as it goes while the command travels. What both allow is where the next move begins.
 """
@@ -37,7 +37,7 @@ ROUNDED = 1.01  # a servo rounds its acceleration up to its own unit
 class _SentMove:
     """The move that was let through last."""
 
-    within: Span | None  # None: nobody knew where it began
+    within: Span | None  # None: where it began was not known
     goal: Pair
     speed_rad_per_s: float
     at_s: float
@@ -48,23 +48,16 @@ class KeepOutJudge:
 
     Parameters
     ----------
-    limits
-        Of the configuration.
     head
-        May say how its axes move.
+        May state how its axes move.
     clock
         The sun's directions end by it.
     device
         The head's name, in errors.
     rig
         The mast file's content; without it no sun is kept out.
-    sun
-        Of the configuration.
 
-    Raises
-    ------
-    BadOptions
-        If the head says that it speeds up faster than the limits allow.
+    Raises BadOptions if the head states that it speeds up faster than the limits allow.
     """
 
     def __init__(
@@ -95,7 +88,7 @@ class KeepOutJudge:
 
     @property
     def counts_rad(self) -> Mapping[str, float]:
-        """One count of ``pan`` and of ``tilt``, as far as the head says it."""
+        """One count of ``pan`` and of ``tilt``, as far as the head states it."""
         return {axis: one.count_rad for axis, one in self._stated.items() if one.count_rad}
 
     def turns_to(self, goal: Pair) -> tuple[int, int]:
@@ -108,7 +101,7 @@ class KeepOutJudge:
 
     @property
     def axes(self) -> Mapping[str, AxisMotion]:
-        """How the axes move, where the head says it."""
+        """How the axes move, where the head states it."""
         return self._stated
 
     @property
@@ -121,12 +114,9 @@ class KeepOutJudge:
         return speed_rad_per_s**2 / (2.0 * self._braking_rad_per_s2)
 
     def use_limits(self, limits: Limits) -> None:
-        """Let moves go out within other limits and keep-outs; a head that stands outside may go back in.
+        """Let moves go out within other limits and keep-outs; a head that is outside may go back in.
 
-        Raises
-        ------
-        BadOptions
-            If the head says that it speeds up faster than the limits allow; nothing has changed.
+        Raises BadOptions if the head states that it speeds up faster than these allow; nothing has changed.
         """
         _check_acceleration(limits, self._stated, self._device)
         assumed = limits.acceleration_rad_per_s2 or ASSUMED_RAD_PER_S2
@@ -138,7 +128,7 @@ class KeepOutJudge:
             self._renew()
 
     def use_rig(self, rig: Rig) -> None:
-        """Take another mast file's cameras to judge the sun by."""
+        """Judge the sun by another mast file's cameras."""
         with self._lock:
             self._rig = rig
             self._renew()
@@ -150,7 +140,7 @@ class KeepOutJudge:
             self._renew()
 
     def rover_stands(self, rover_from_site: FloatArray) -> None:
-        """Take how the rover stands, (3, 3): a sun told in the site frame turns with it."""
+        """Turn a sun of the site frame with the rover, (3, 3)."""
         with self._lock:
             self._rover_from_site = rover_from_site
             self._renew()
@@ -162,45 +152,32 @@ class KeepOutJudge:
         if keep_outs is not None:
             keep_outs.check_goal((pan_rad, tilt_rad))
 
-    def check_from(self, here: Pair, goal: Pair) -> None:
-        """Pass a goal to which a head that rests ``here`` may be sent.
+    def check_from(self, start: Pair, goal: Pair) -> None:
+        """Pass a goal to which a head that rests at ``start`` may be sent.
 
-        Raises
-        ------
-        OutsideLimits
-            If the goal may not be commanded.
-        KeptOut
-            If a keep-out holds the goal, or lies where the move may pass; it names the nearest free goal.
+        Raises OutsideLimits; KeptOut, which names the nearest free goal, if a keep-out holds the goal, or
+        lies where the move may pass.
         """
         self.limits.check(*goal)
         keep_outs = self._now()
         if keep_outs is not None:
-            keep_outs.refuse_unless_free(Span.around(here), goal, True)
+            keep_outs.refuse_unless_free(Span.around(start), goal, True)
 
-    def room(self, here: Pair) -> Span | None:
+    def room(self, place: Pair) -> Span | None:
         """Return a wide free rectangle within the limits about a place; None for one that is kept out.
 
-        A place beyond the limits counts as on them.
+        A place beyond the limits is treated as on them.
         """
         limits, keep_outs = self.limits, self._now()
         within = Span(limits.pan_rad, limits.tilt_rad)
-        on = _into(here[0], limits.pan_rad), _into(here[1], limits.tilt_rad)
+        on = _into(place[0], limits.pan_rad), _into(place[1], limits.tilt_rad)
         return within if keep_outs is None else keep_outs.room(on, within)
 
     def check_move(self, goal: Pair, read: Callable[[], Reading]) -> Span | None:
-        """Pass a move that may go out now; return where it begins, as `sent` takes it.
+        """Pass a move to a goal within the limits that may go out now; return where it begins, for `sent`.
 
-        Parameters
-        ----------
-        goal
-            (pan, tilt), within the limits.
-        read
-            Measures the head; only asked where there is something to keep out.
-
-        Raises
-        ------
-        KeptOut
-            If the head might pass a keep-out.
+        ``read`` measures the head; only where there is something to keep out. Raises KeptOut if the head
+        might pass a keep-out.
         """
         keep_outs = self._now()
         if keep_outs is None:
@@ -224,7 +201,7 @@ class KeepOutJudge:
         other goes on. Where not a step is free, the answer is where the head was read.
         """
         limits = self.limits
-        here = reading.pan_rad, reading.tilt_rad
+        at = reading.pan_rad, reading.tilt_rad
         goal = _into(goal[0], limits.pan_rad), _into(goal[1], limits.tilt_rad)
         keep_outs = self._now()
         if keep_outs is None:
@@ -241,45 +218,38 @@ class KeepOutJudge:
         def part(way: Callable[[float], Pair]) -> Pair | None:
             return next((place for n in range(PARTS, 0, -1) if free(place := way(n / PARTS))), None)
 
-        held = stay or here
-        (pan, tilt), (to_pan, to_tilt) = here, goal
+        kept = stay or at
+        (pan, tilt), (to_pan, to_tilt) = at, goal
         ways = (
             part(lambda share: (pan + share * (to_pan - pan), tilt + share * (to_tilt - tilt))),
-            part(lambda share: (pan + share * (to_pan - pan), held[1])),
-            part(lambda share: (held[0], tilt + share * (to_tilt - tilt))),
+            part(lambda share: (pan + share * (to_pan - pan), kept[1])),
+            part(lambda share: (kept[0], tilt + share * (to_tilt - tilt))),
         )
         found = [one for one in ways if one is not None]
-        return max(found, key=lambda one: abs(one[0] - pan) + abs(one[1] - tilt), default=here)
+        return max(found, key=lambda one: abs(one[0] - pan) + abs(one[1] - tilt), default=at)
 
     def faults(self, reading: Reading | None) -> tuple[StandingFault, ...]:
-        """Return what stands against the head's place, and a sun that is known no longer."""
-        now_s = self._clock.now_s()
+        """Return what is wrong with the head's place, and a sun that is known no longer."""
         found = []
         sun = self._sun
-        if sun is not None and sun.until_s is not None and not sun.holds(now_s):
-            words = "the stated direction of the sun has expired, and nothing keeps the cameras off it"
-            found.append(
-                StandingFault(
-                    SUN, "sun_not_known", words, sun.until_s, "another direction is stated, or none"
-                )
-            )
-        keep_outs = self._now()
+        if sun is not None and sun.until_s is not None and not sun.holds(self._clock.now_s()):
+            message = "the stated direction of the sun has expired, and nothing keeps the cameras off it"
+            until = "another direction is stated, or none"
+            found.append(StandingFault(SUN, "sun_not_known", message, sun.until_s, until))
         if reading is None:
             return tuple(found)
-        here = Span.around((reading.pan_rad, reading.tilt_rad))
-        holding = () if keep_outs is None else keep_outs.holding(here)
+        keep_outs = self._now()
+        at = Span.around((reading.pan_rad, reading.tilt_rad))
+        holding = () if keep_outs is None else keep_outs.holding(at)
         before_s = self._inside_s
         self._inside_s = {box.name: before_s.get(box.name, reading.time_s) for box in holding}
         for name, since_s in self._inside_s.items():
-            words = "a head camera looks into the cone around the sun"
-            code, until = (
-                "sun_in_view",
-                "the head is moved out of it, or another direction of the sun is stated",
-            )
+            code, message = "sun_in_view", "a head camera looks into the cone around the sun"
+            until = "the head is moved out of it, or another direction of the sun is stated"
             if name != SUN:
-                words, code = f"the head stands in the keep-out {name}", "in_keep_out"
+                code, message = "in_keep_out", f"the head stands in the keep-out {name}"
                 until = "it is moved out, the shortest way along one axis"
-            found.append(StandingFault(name, code, words, since_s, until))
+            found.append(StandingFault(name, code, message, since_s, until))
         return tuple(found)
 
     def in_the_way(self, reading: Reading | None) -> str | None:
@@ -293,13 +263,13 @@ class KeepOutJudge:
         start, rests = self._start(reading)
         if rests:
             return None
-        held = {box.name for box in keep_outs.holding(Span.around((reading.pan_rad, reading.tilt_rad)))}
+        inside = {box.name for box in keep_outs.holding(Span.around((reading.pan_rad, reading.tilt_rad)))}
         ends_in = keep_outs.holding(self._round(sent.goal))
-        passes = (box for box in keep_outs.holding(start) if box.name not in held)
+        passes = (box for box in keep_outs.holding(start) if box.name not in inside)
         return next((box.name for box in (*ends_in, *passes)), None)
 
-    def told(self) -> SunTold:
-        """Return the sun as ``GET /limits/sun`` tells it."""
+    def sun_as_json(self) -> SunTold:
+        """Return the sun as ``GET /limits/sun`` has it."""
         sun, now_s = self._sun, self._clock.now_s()
         if sun is None:
             return {"sun": None, "boxes": []}
@@ -321,18 +291,18 @@ class KeepOutJudge:
 
     def _start(self, reading: Reading) -> tuple[Span, bool]:
         """Where the next move begins, and whether the head rests there."""
-        here = Span.around((reading.pan_rad, reading.tilt_rad))
+        at = Span.around((reading.pan_rad, reading.tilt_rad))
         sent = self._sent
         rests = not reading.moving and (sent is None or self._clock.now_s() - sent.at_s > REST_S)
         if rests:
-            return here, True
+            return at, True
         speed = self.limits.speed_rad_per_s if sent is None else sent.speed_rad_per_s
         far = self.braking_rad(speed) + speed * TRAVEL_S
-        near = here.grown(far, far)
+        near = at.grown(far, far)
         if sent is None:
             return near, False
         start = (near if sent.within is None else near.overlap(sent.within)) or near
-        return Span.around(*start.corners, *here.corners, sent.goal), False
+        return Span.around(*start.corners, *at.corners, sent.goal), False
 
     def _round(self, goal: Pair) -> Span:
         return Span.around(goal).grown(self._beyond[0], self._beyond[1])
@@ -343,7 +313,7 @@ class KeepOutJudge:
         return self._boxes[sun is not None and sun.holds(self._clock.now_s())]
 
     def _renew(self) -> None:
-        """Make the boxes anew; the lock is held."""
+        """Make the boxes anew; the lock is kept."""
         limits, sun = self.limits, self._sun
         slack = limits.margin_rad + self._beyond[1]
         # A copy of each box for every turn that the pan reaches, and for where a hand may have pushed it.

@@ -3,8 +3,7 @@
 The two axes of a head turn each at its own pace, so between its start and its goal it may be anywhere in the
 rectangle that both span, and beyond its goal by as much as it passes it on purpose to come back to it from
 one side. A move is free if all this keeps the margin of every box: what a head overshoots. A box itself is
-open: its edge may be touched. Pan angles a whole turn apart show the same place, so a box is there once a
-turn.
+open: its edge may be touched. Pan angles a whole turn apart show the same place, so a box exists once a turn.
 """
 
 from __future__ import annotations
@@ -24,13 +23,8 @@ ASIDE_RAD = 5e-3  # a move along one axis leaves the other where it was read: th
 class KeptOut(BadRequest):
     """A goal, or the move to it, lies in a keep-out.
 
-    Attributes
-    ----------
-    name
-        Of the keep-out.
-    nearest
-        Of the goals that the head may be sent to, the one nearest to the refused goal: (pan, tilt), radians.
-        None if it was not searched for, or there is none.
+    ``nearest`` is the goal nearest to the refused one that the head may be sent to: (pan, tilt), radians;
+    None if it was not searched, or there is none.
     """
 
     def __init__(self, name: str, message: str, nearest: Pair | None = None) -> None:
@@ -116,26 +110,17 @@ class Box:
         turns = [turn * math.tau for turn in range(first, last + 1)]
         return [Box(self.name, (low + turn, high + turn), self.tilt_rad) for turn in turns]
 
-    def told(self) -> str:
-        """Say which it is and where."""
+    def __str__(self) -> str:
         pan, tilt = (f"{low:.4g} to {high:.4g}" for low, high in (self.pan_rad, self.tilt_rad))
         return f"keep-out {self.name} (pan {pan}, tilt {tilt} rad)"
 
 
 @dataclass(frozen=True)
 class KeepOuts:
-    """All boxes of a moment, and the room around them.
+    """All boxes of a moment, copies over the whole range of pan included, with a margin around each.
 
-    Attributes
-    ----------
-    boxes
-        Copies over the whole range of pan included.
-    margin_rad
-        Around each.
-    beyond_rad
-        How far the head may pass a goal on purpose, in pan and in tilt.
-    pan_rad, tilt_rad
-        The joint limits: a path out of a box, and a nearest free goal, lie within them.
+    ``beyond_rad`` is how far the head may pass a goal on purpose, in pan and in tilt. ``pan_rad`` and
+    ``tilt_rad`` are the joint limits: a path out of a box, and a nearest free goal, lie within them.
     """
 
     boxes: tuple[Box, ...]
@@ -164,9 +149,9 @@ class KeepOuts:
         for box, full in zip(self.boxes, self.full, strict=True):
             if point.enters(full):
                 where = "in" if point.enters(box.span) else "too near to"
-                raise KeptOut(box.name, f"{_told(goal)} is {where} the {box.told()}{self._slack_told()}")
+                raise KeptOut(box.name, f"{_text(goal)} is {where} the {box}{self._slack_text()}")
 
-    def room(self, here: Pair, most: Span) -> Span | None:
+    def room(self, place: Pair, most: Span) -> Span | None:
         """Return a wide part of ``most`` around a place in it that no keep-out reaches into, or None.
 
         Each keep-out takes the side away that leaves the most; one that holds the place leaves nothing.
@@ -174,7 +159,7 @@ class KeepOuts:
         for full in self.full:
             if not most.enters(full):
                 continue
-            (pan, tilt), (low, high) = here, most.corners
+            (pan, tilt), (low, high) = place, most.corners
             sides = [
                 Span.around((max(low[0], full.pan_rad[1]), low[1]), high),
                 Span.around(low, (min(high[0], full.pan_rad[0]), high[1])),
@@ -206,10 +191,7 @@ class KeepOuts:
         A head in the margin of a box may go where that is not nearer. One in a box itself may leave it the
         shortest way along one axis, from rest.
 
-        Raises
-        ------
-        KeptOut
-            If the goal, or any place that the head may pass, is kept out.
+        Raises KeptOut if the goal, or any place that the head may pass, is kept out.
         """
         self.check_goal(goal)
         inside = self.holding(start)
@@ -221,17 +203,14 @@ class KeepOuts:
             if way.enters(near):
                 raise KeptOut(
                     box.name,
-                    f"between {_told(_middle(start))} and {_told(goal)} the head may pass the {box.told()}"
-                    f"{self._slack_told()}: each axis goes at its own pace",
+                    f"between {_text(_middle(start))} and {_text(goal)} the head may pass the {box}"
+                    f"{self._slack_text()}: each axis goes at its own pace",
                 )
 
     def refuse_unless_free(self, start: Span, goal: Pair, rests: bool) -> None:
         """Check a move as `check_move` does, and search for the nearest free goal where it is refused.
 
-        Raises
-        ------
-        KeptOut
-            With the nearest free goal in its message.
+        Raises KeptOut: with the nearest free goal in its message.
         """
         try:
             self.check_move(start, goal, rests)
@@ -239,7 +218,7 @@ class KeepOuts:
             nearest = self.nearest_free(start, goal, rests)
             advice = "from there no goal is free"
             if nearest is not None:
-                advice = f"the nearest goal that is free from there is {_told(nearest)}"
+                advice = f"the nearest goal that is free from there is {_text(nearest)}"
             raise KeptOut(refused.name, f"{refused}; {advice}", nearest) from None
 
     def nearest_free(self, start: Span, goal: Pair, rests: bool) -> Pair | None:
@@ -248,12 +227,12 @@ class KeepOuts:
         What may be reached is bounded by edges of boxes, grown by the room that goals and moves keep. So each
         coordinate of the nearest one lies on such an edge, or is the start's, the goal's or a limit's.
         """
-        here = _middle(start)
-        out = self.way_out(here) if self.holding(start) else None
+        middle = _middle(start)
+        out = self.way_out(middle) if self.holding(start) else None
         lines = []
         for axis, limits in enumerate((self.pan_rad, self.tilt_rad)):
             past = self.beyond_rad[axis]
-            edges = {here[axis], min(max(goal[axis], limits[0]), limits[1]), *limits}
+            edges = {middle[axis], min(max(goal[axis], limits[0]), limits[1]), *limits}
             edges |= {edge for full in self.full for edge in (full.pan_rad, full.tilt_rad)[axis]}
             for near in self.near(start):
                 low, high = (near.pan_rad, near.tilt_rad)[axis]
@@ -273,56 +252,58 @@ class KeepOuts:
             return False
         return True
 
-    def way_out(self, here: Pair) -> Pair | None:
+    def way_out(self, place: Pair) -> Pair | None:
         """Return where the shortest way along one axis leaves the boxes that hold the head; None if none.
 
         It passes no other keep-out and ends within the joint limits.
         """
-        names = {box.name for box in self.holding(Span.around(here))}
+        names = {box.name for box in self.holding(Span.around(place))}
         found = []
         for axis, limits in ((0, self.pan_rad), (1, self.tilt_rad)):
             for side in (-1, 1):
-                end = self._end_along(here, axis, side, names)
+                end = self._end_along(place, axis, side, names)
                 if end is not None and limits[0] <= end[axis] <= limits[1]:
-                    found.append((abs(end[axis] - here[axis]), end))
+                    found.append((abs(end[axis] - place[axis]), end))
         return min(found)[1] if found else None
 
-    def _end_along(self, here: Pair, axis: int, side: int, names: set[str]) -> Pair | None:
+    def _end_along(self, place: Pair, axis: int, side: int, names: set[str]) -> Pair | None:
         """The first place in one direction where a goal may be; None if another keep-out comes before."""
-        end = here
+        end = place
         for _ in range(2 * len(self.boxes) + 1):
             point = Span.around(end)
-            held = [full for full in self.full if point.enters(full)]
-            if not held:
-                way = Span.around(here, end)
+            inside = [full for full in self.full if point.enters(full)]
+            if not inside:
+                way = Span.around(place, end)
                 other = [box for box in self.boxes if box.name not in names and way.enters(box.span)]
                 return None if other else end
-            edges = [(full.pan_rad, full.tilt_rad)[axis][side > 0] for full in held]
+            edges = [(full.pan_rad, full.tilt_rad)[axis][side > 0] for full in inside]
             edge = max(edges) if side > 0 else min(edges)
             end = (edge, end[1]) if axis == 0 else (end[0], edge)
         return None
 
     def _check_way_out(self, start: Span, goal: Pair, rests: bool, box: Box) -> None:
         """Pass a move out of the box that holds the head. Raises KeptOut."""
-        here = _middle(start)
-        words = f"the head stands in the {box.told()}"
+        at = _middle(start)
+        inside = f"the head stands in the {box}"
         if not rests:
-            raise KeptOut(box.name, f"{words} and moves; it is led out when it rests")
-        end = self.way_out(here)
+            raise KeptOut(box.name, f"{inside} and moves; it is led out when it rests")
+        end = self.way_out(at)
         if end is None:
-            raise KeptOut(box.name, f"{words}, and no way along one axis leads out of it; turn it by hand")
-        axis = 0 if abs(end[0] - here[0]) > abs(end[1] - here[1]) else 1
-        out = end[axis] - here[axis]
+            raise KeptOut(box.name, f"{inside}, and no way along one axis leads out of it; turn it by hand")
+        axis = 0 if abs(end[0] - at[0]) > abs(end[1] - at[1]) else 1
+        out = end[axis] - at[axis]
         along = (goal[axis] - end[axis]) * math.copysign(1.0, out) >= -ASIDE_RAD
-        rest = Span.around((goal[0], here[1]) if axis == 0 else (here[0], goal[1]), end)
+        rest = Span.around((goal[0], at[1]) if axis == 0 else (at[0], goal[1]), end)
         if (
             not along
-            or abs(goal[1 - axis] - here[1 - axis]) > ASIDE_RAD
+            or abs(goal[1 - axis] - at[1 - axis]) > ASIDE_RAD
             or any(rest.enters(full) for full in self.full)
         ):
-            raise KeptOut(box.name, f"{words}; the one move that is taken from there is out, to {_told(end)}")
+            raise KeptOut(
+                box.name, f"{inside}; the one move that is taken from there is out, to {_text(end)}"
+            )
 
-    def _slack_told(self) -> str:
+    def _slack_text(self) -> str:
         pan, tilt = self.slack_rad
         if pan == tilt:
             return f" with {pan:.3g} rad around it" if pan > 0.0 else ""
@@ -333,5 +314,5 @@ def _middle(span: Span) -> Pair:
     return sum(span.pan_rad) / 2, sum(span.tilt_rad) / 2
 
 
-def _told(place: Pair) -> str:
+def _text(place: Pair) -> str:
     return f"pan {place[0]:.4g}, tilt {place[1]:.4g} rad"

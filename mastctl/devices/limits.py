@@ -18,12 +18,8 @@ from mastctl.errors import BadRequest
 class OutsideLimits(BadRequest):
     """A joint angle or speed that must not be commanded.
 
-    Attributes
-    ----------
-    what
-        ``pan``, ``tilt`` or ``speed``.
-    value, bound
-        The asked value and the limit it breaks, in ``unit``; the bound is NaN for a value that is no number.
+    ``what``: ``pan``, ``tilt`` or ``speed``; ``value``, ``bound``: the requested value and the limit it
+    breaks, in ``unit``; NaN for a value that is no number.
     """
 
     def __init__(self, what: str, value: float, bound: float, unit: str, message: str) -> None:
@@ -51,17 +47,14 @@ class Limits:
     speed_rad_per_s
         Fastest joint speed.
     margin_rad
-        Around every keep-out: no goal lies in it, and no way but that of a head which stands in it already.
+        Around every keep-out: no goal lies in it, and no move but that of a head which is in it already.
         The ranges above are those inside it.
     acceleration_rad_per_s2
         The head's axes speed up and brake with no more; None: whatever they do.
     keep_out
         Where the head must not be (`mastctl.devices.keep_out`).
 
-    Raises
-    ------
-    ValueError
-        If a bound is not finite, a range is empty, or speed or acceleration is not positive.
+    Raises ValueError if a bound is not finite, a range is empty, or speed or acceleration is not positive.
     """
 
     pan_rad: tuple[float, float]
@@ -86,46 +79,38 @@ class Limits:
             raise ValueError(f"margin_rad is {self.margin_rad} where 0 or more is expected")
 
     def check(self, pan_rad: float, tilt_rad: float) -> None:
-        """Pass joint angles that may be commanded.
-
-        Raises
-        ------
-        OutsideLimits
-            If an angle is not a finite number or lies beyond its limit; says value, bound and unit.
-        """
+        """Pass joint angles that may be commanded. Raises OutsideLimits."""
         for axis, value, bounds in (("pan", pan_rad, self.pan_rad), ("tilt", tilt_rad, self.tilt_rad)):
             if not math.isfinite(value):
                 raise OutsideLimits(axis, value, math.nan, "rad", f"{axis} {value} rad is not a finite angle")
             low, high = bounds
             if value < low or value > high:
                 bound = low if value < low else high
-                told_value, told_bound = _told_apart(value, bound)
+                shown_value, shown_bound = _apart(value, bound)
                 unwound = value - math.copysign(math.tau, value)
                 hint = f"; {unwound:.6g} rad points the same way" if low <= unwound <= high else ""
                 raise OutsideLimits(
                     axis, value, bound, "rad",
-                    f"{axis} {told_value} rad is beyond the soft limit {told_bound} rad{hint}",
+                    f"{axis} {shown_value} rad is beyond the soft limit {shown_bound} rad{hint}",
                 )  # fmt: skip
 
-    def speed(self, asked_rad_per_s: float | None) -> float:
-        """Return the speed to command: the asked one up to the cap, the cap when none was asked.
+    def speed(self, requested_rad_per_s: float | None) -> float:
+        """Return the speed to command: the requested one up to the cap, the cap by default.
 
-        Raises
-        ------
-        OutsideLimits
-            If the asked speed is not a finite number above 0: some servos take 0 for "as fast as possible".
+        Raises OutsideLimits if it is not a finite number above 0: some servos treat 0 as "as fast as
+        possible".
         """
-        if asked_rad_per_s is None:
+        if requested_rad_per_s is None:
             return self.speed_rad_per_s
-        if not (math.isfinite(asked_rad_per_s) and asked_rad_per_s > 0.0):
+        if not (math.isfinite(requested_rad_per_s) and requested_rad_per_s > 0.0):
             raise OutsideLimits(
-                "speed", asked_rad_per_s, 0.0, "rad/s",
-                f"speed {asked_rad_per_s} rad/s is not a finite number above 0 rad/s",
+                "speed", requested_rad_per_s, 0.0, "rad/s",
+                f"speed {requested_rad_per_s} rad/s is not a finite number above 0 rad/s",
             )  # fmt: skip
-        return min(asked_rad_per_s, self.speed_rad_per_s)
+        return min(requested_rad_per_s, self.speed_rad_per_s)
 
 
-def _told_apart(value: float, bound: float) -> tuple[str, str]:
+def _apart(value: float, bound: float) -> tuple[str, str]:
     """Write two different numbers briefly, but so that they differ."""
     brief = f"{value:.6g}", f"{bound:.6g}"
     return brief if brief[0] != brief[1] else (repr(value), repr(bound))
@@ -142,7 +127,7 @@ Frame = Literal["rover", "site"]
 
 @dataclass(frozen=True)
 class SunDirection:
-    """Where it stands and how near a camera may look.
+    """Where the sun is and how near to it a camera may look.
 
     Attributes
     ----------
@@ -153,7 +138,7 @@ class SunDirection:
     half_angle_rad
         Of the cone around it.
     until_s
-        When it holds no longer, seconds of CLOCK_MONOTONIC; None: until another is told.
+        When it holds no longer, seconds of CLOCK_MONOTONIC; None: until another is stated.
     """
 
     direction: tuple[float, float, float]
@@ -173,18 +158,10 @@ def direction_of(azimuth_rad: float, elevation_rad: float) -> tuple[float, float
 
 
 def sun_boxes(rig: Rig, in_rover: FloatArray, half_angle_rad: float, tilt_rad: Pair) -> tuple[Box, ...]:
-    """Return boxes that together hold every pose in which a head camera looks into the cone.
+    """Return boxes of true angles that together hold every pose in which a head camera looks into the cone.
 
-    Parameters
-    ----------
-    rig
-        The mast file's content; body cameras do not turn and are left aside.
-    in_rover
-        (3,) unit vector towards the sun, rover frame.
-    half_angle_rad
-        Of the cone.
-    tilt_rad
-        The range of true tilt that is wanted; the boxes are of true angles too.
+    ``in_rover`` is (3,), the unit vector towards the sun in the rover frame; ``tilt_rad`` the range of true
+    tilt that is wanted. Body cameras do not turn and are left aside.
     """
     sun = rig.mast.rover_from_mast.rotation.T @ in_rover
     axes = {tuple(camera.model.A.tolist()) for camera in rig.cameras.values() if camera.on == "head"}
@@ -206,7 +183,7 @@ def sun_boxes(rig: Rig, in_rover: FloatArray, half_angle_rad: float, tilt_rad: P
 
 
 def _pans(axis: FloatArray, sun: FloatArray, angle_rad: float) -> Iterator[Pair]:
-    """The interval of pan at which an axis stands within an angle of the sun, both in the mast frame."""
+    """The interval of pan at which an axis is within an angle of the sun, both in the mast frame."""
     level = math.hypot(axis[0], axis[1]) * math.hypot(sun[0], sun[1])
     wanted = math.cos(min(angle_rad, math.pi)) - float(axis[2] * sun[2])
     if wanted > level:

@@ -1,7 +1,7 @@
-"""The one way to open a head: nothing else in this program does (held by the import contracts).
+"""Opening a head: nothing else in this program does (checked by the import contracts).
 
-Whoever opens one holds its place (`mastctl.safety.heads`), so that no other program drives it; knows its
-latch; and moves it within limits, around keep-outs and off the sun, as `mastctl.devices.judge` judges.
+The program that opens one locks its place (`mastctl.safety.heads`), so that no other program drives it; knows
+its latch; and moves it within limits, around keep-outs and off the sun, as `mastctl.devices.judge` judges.
 """
 
 from __future__ import annotations
@@ -38,16 +38,8 @@ STILL = "this program moves no head"
 class Bounds:
     """What bounds the moves of a head that is opened beside a daemon.
 
-    Attributes
-    ----------
-    limits
-        Soft limits and keep-outs.
-    stored
-        The mast file, whose cameras the sun is judged by; None: there is none.
-    sun
-        The direction that is kept out of the cameras' sight.
-    state
-        The state folder of the head's daemon: a stop that is latched there holds too.
+    The sun is judged by the cameras of the mast file ``stored``. ``state`` is the state folder of the head's
+    daemon: a stop that is latched there holds too.
     """
 
     limits: Limits
@@ -61,12 +53,8 @@ def open_rig(settings: HardwareSettings, clock: Clock) -> tuple[Hardware, StateF
 
     The place is None for a head in memory, and for one that says it is simulated: it is as good as in memory.
 
-    Raises
-    ------
-    StateInUse
-        If another program drives the head; nothing was opened.
-    DriverError
-        As `drivers.open_hardware.open_hardware`.
+    Raises StateInUse if another program drives the head; DriverError: as
+    `drivers.open_hardware.open_hardware`.
     """
     with ExitStack() as undo:
         place = heads.of_settings(settings)
@@ -85,28 +73,17 @@ def devices_beside(
 ) -> Iterator[tuple[Devices, Mapping[str, Camera]]]:
     """Open a rig for a program beside the daemon; leaving stops and closes it.
 
-    Parameters
-    ----------
-    settings, bounds, clock
-        The rig, with its mast file, and what bounds its moves.
-    moves
-        Whether the head is to be moved; if not, no move is let out.
-    own_cameras
-        Whether the caller asks the cameras itself; `Devices` has none then.
+    ``moves``: whether the head is to be moved; if not, no move is let out; ``own_cameras``: whether the
+    caller takes images itself; `Devices` has no cameras then.
 
     Yields
     ------
     Devices, Mapping of str to Camera
         The head's moves pass the first; the cameras are in both, or in the second alone.
 
-    Raises
-    ------
-    Estopped
-        If the head is to be moved and its emergency stop is latched; nothing was opened.
-    StateInUse
-        If another program drives the head; nothing was opened.
-    DriverError
-        As `drivers.open_hardware.open_hardware`.
+    Raises Estopped if the head is to be moved and its emergency stop is latched (nothing was opened);
+    StateInUse if another program drives the head; DriverError: as
+    `drivers.open_hardware.open_hardware`.
     """
     stored = bounds.stored
     assert stored is not None
@@ -125,7 +102,7 @@ def devices_beside(
 def head_beside(
     settings: HardwareSettings, bounds: Bounds, clock: Clock, *, moves: bool
 ) -> Iterator[Callable[[], GuardedHead]]:
-    """Hold a head's place for a test of its driver; yields what opens the head, as often as it is called.
+    """Lock a head's place for a test of its driver; yields what opens the head, as often as it is called.
 
     Parameters and errors are those of `devices_beside`; no camera is opened. Leaving closes what was opened.
     """
@@ -141,26 +118,20 @@ def head_beside(
 
 @contextmanager
 def line_held(port: str) -> Iterator[None]:
-    """Hold the place of the head at a line, for a program that moves what is on it without a configuration.
+    """Lock the place of the head at a line, for a program that moves what is on it without a configuration.
 
-    Limits and keep-outs are not known there. Raises Estopped, StateInUse.
+    Limits and keep-outs are not known then. Raises Estopped, StateInUse.
     """
-    with _held(stable_name(port), moves=True):
+    with _locked(stable_name(port), moves=True):
         yield
 
 
 class GuardedHead(PanTilt):
-    """A head whose every move is judged by the door before it goes out; safe as far as the driver is.
+    """A head whose every move is judged before it goes out; safe as far as the driver is."""
 
-    Attributes
-    ----------
-    door
-        What judges.
-    """
-
-    def __init__(self, head: PanTilt, door: KeepOutJudge, moves: bool) -> None:
+    def __init__(self, head: PanTilt, judge: KeepOutJudge, moves: bool) -> None:
         self._head = head
-        self.door = door
+        self.judge = judge
         self._moves = moves
         self._moving = threading.Lock()  # what was judged goes out before the next is judged
 
@@ -176,18 +147,12 @@ class GuardedHead(PanTilt):
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         """Start the head towards a goal.
 
-        Raises
-        ------
-        OutsideLimits, KeptOut
-            If goal or speed may not be commanded, or the head might pass a keep-out; nothing was sent.
-        Stopped
-            If this program moves no head.
-        DriverError
-            From the driver.
+        Raises OutsideLimits, KeptOut if goal or speed may not be commanded, or the head might pass a
+        keep-out, and nothing was sent; Stopped if this program moves no head; DriverError: from the driver.
         """
         goal = pan_rad, tilt_rad
-        self.door.limits.check(*goal)
-        speed = self.door.limits.speed(speed_rad_per_s)
+        self.judge.limits.check(*goal)
+        speed = self.judge.limits.speed(speed_rad_per_s)
         with self._moving:
             self._judged(goal, speed)
             self._head.move(*goal, speed)
@@ -198,12 +163,12 @@ class GuardedHead(PanTilt):
         What is judged is where a driver that takes it could go: to the limits, or nowhere for what is no
         number. Raises as `move`.
         """
-        limits, here = self.door.limits, self._head.read()
+        limits, now = self.judge.limits, self._head.read()
         pan, tilt = (
-            at if math.isnan(asked) else min(max(asked, low), high)
-            for asked, at, (low, high) in (
-                (pan_rad, here.pan_rad, limits.pan_rad),
-                (tilt_rad, here.tilt_rad, limits.tilt_rad),
+            at if math.isnan(goal) else min(max(goal, low), high)
+            for goal, at, (low, high) in (
+                (pan_rad, now.pan_rad, limits.pan_rad),
+                (tilt_rad, now.tilt_rad, limits.tilt_rad),
             )
         )
         with self._moving:
@@ -221,20 +186,20 @@ class GuardedHead(PanTilt):
     def _judged(self, goal: tuple[float, float], speed_rad_per_s: float) -> None:
         if not self._moves:
             raise Stopped(STILL)
-        start = self.door.check_move(goal, self._head.read)
-        self.door.sent(start, goal, speed_rad_per_s)
+        start = self.judge.check_move(goal, self._head.read)
+        self.judge.sent(start, goal, speed_rad_per_s)
 
 
 @contextmanager
 def _alone(settings: HardwareSettings, moves: bool, state: Path | None) -> Iterator[None]:
-    """Hold the head's place; who moves it finds no stop latched."""
-    name = head_name(settings)  # in memory it is nobody else's
-    with contextlib.nullcontext() if name is None else _held(name, moves=moves, state=state):
+    """Lock the head's place; one that is to be moved has no stop latched."""
+    name = head_name(settings)  # in memory it is no other program's
+    with contextlib.nullcontext() if name is None else _locked(name, moves=moves, state=state):
         yield
 
 
 @contextmanager
-def _held(name: str, *, moves: bool, state: Path | None = None) -> Iterator[None]:
+def _locked(name: str, *, moves: bool, state: Path | None = None) -> Iterator[None]:
     place = heads.take(name)
     try:
         if moves:

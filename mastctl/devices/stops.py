@@ -1,7 +1,7 @@
 """The stops of a head: each goes out whatever hangs, and no move goes out before all of them are back.
 
 A driver that hangs may carry out an old stop much later. A move that was sent meanwhile would end half-way
-without a reason, so moves are refused until every stop is back, and one that comes back late is told.
+without a reason, so moves are refused until every stop is back, and one that comes back late is a fault.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mastctl.errors import MastctlError, Stopped
 
 PATIENCE_S = 0.05  # how long a stop waits for the head's own thread before it goes out beside it
 AT_ONCE_S = 0.002  # the same for a driver that is at its best beside a call under way
-LATEST_SHARE = 1 / 8  # of the time that a head hangs already: a new stop waits no longer for its own way
+LATEST_SHARE = 1 / 8  # of the time that a head hangs already: a new stop waits no longer for its own thread
 MAY_MOVE = "the head may still move"
 UNTIL = "a stop is confirmed, or a later move is taken and the head then rests"
 UNTIL_LINE = "the line is back and the head rests, or a stop is confirmed"
@@ -25,9 +25,9 @@ UNTIL_LINE = "the line is back and the head rests, or a stop is confirmed"
 
 @dataclass(frozen=True)
 class _Inside:
-    """A stop inside the driver: when it was asked for, and when it went in."""
+    """A stop inside the driver: when it was requested, and when it went in."""
 
-    asked_s: float
+    requested_s: float
     began_s: float
 
 
@@ -39,18 +39,9 @@ class StopRequests:
     answer badly, but a stop that arrives is worth more than an answer. The one in the queue follows when the
     hanging call is back, since that may have been a move.
 
-    Parameters
-    ----------
-    thread
-        The head's own thread.
-    device
-        The head's name.
-    stop
-        The driver's stop.
-    clock
-        What deadlines run on; the machine's own by default.
-    patience_s
-        How long a stop waits for the head's own thread before it goes out beside it, seconds.
+    ``thread``, ``device``, ``stop``: the head's own thread, its name, and the driver's stop; ``clock``: what
+    deadlines run on; the machine's own by default; ``patience_s``: how long a stop waits for the head's own
+    thread before it goes out beside it, seconds.
     """
 
     def __init__(
@@ -67,8 +58,8 @@ class StopRequests:
         self._device = device
         self._stop = stop
         self._changed = self._clock.signal()
-        self._asked = 0
-        self._queued_s: float | None = None  # when the stop was asked for that waits in the head's thread
+        self._count = 0
+        self._queued_s: float | None = None  # when the stop was requested that waits in the head's thread
         self._inside: list[_Inside] = []
         self._good_s = float("-inf")  # when a stop came back last that went well
         self._failed: tuple[_Inside, Exception] | None = None
@@ -82,45 +73,41 @@ class StopRequests:
             overdue = self._overdue(self._clock.now_s())
             if overdue:
                 raise Stopped(overdue)
-            return self._asked
+            return self._count
 
     def check(self, ticket: int) -> None:
         """Pass a move that may go out now, in the head's own thread. Raises Stopped."""
         with self._changed:
-            if ticket != self._asked:
+            if ticket != self._count:
                 raise Stopped("a stop came before the move was sent")
             if self._inside:
-                raise Stopped(self._told(self._inside[0].asked_s, self._clock.now_s()))
+                raise Stopped(self._message(self._inside[0].requested_s, self._clock.now_s()))
 
     def send(self, timeout_s: float) -> None:
         """Stop the head and return when that is confirmed, by this stop or by another on its way.
 
-        Raises
-        ------
-        NoReply
-            If no stop was confirmed within ``timeout_s`` seconds; the head may still move.
-        DriverError, MastctlError
-            If the driver refused it.
+        Raises NoReply if no stop was confirmed within ``timeout_s`` seconds; the head may still move;
+        DriverError, MastctlError if the driver refused it.
         """
         with self._clock.at_work():  # a simulation's second does not pass before the stop is queued
             self._confirmed(timeout_s)
 
     def _confirmed(self, timeout_s: float) -> None:
-        asked_s = self._clock.now_s()
+        requested_s = self._clock.now_s()
         try:
-            self._send(asked_s, timeout_s)
+            self._send(requested_s, timeout_s)
         except (DriverError, MastctlError) as error:
-            words = str(error) if MAY_MOVE in str(error) else f"{error}; {MAY_MOVE}"
+            message = str(error) if MAY_MOVE in str(error) else f"{error}; {MAY_MOVE}"
             with self._changed:
-                since_s = asked_s if self._fault is None else self._fault.since_s
+                since_s = requested_s if self._fault is None else self._fault.since_s
                 only_line = error.code == LineLost.code and (
                     self._fault is None or self._fault.until == UNTIL_LINE
                 )  # a lost line takes nothing back of what another stop has left
                 until = UNTIL_LINE if only_line else UNTIL
-                self._fault = StandingFault(self._device, error.code, words, since_s, until)
+                self._fault = StandingFault(self._device, error.code, message, since_s, until)
             raise
         with self._changed:
-            if self._late_s < asked_s:
+            if self._late_s < requested_s:
                 self._fault = None
 
     def returned(self, timeout_s: float) -> bool:
@@ -140,7 +127,7 @@ class StopRequests:
     def proved(self, ticket: int) -> None:
         """Take back what earlier stops left: the move of a later ticket was taken, and the head rests."""
         with self._changed:
-            if ticket == self._asked:
+            if ticket == self._count:
                 self._fault = None
 
     def rests(self) -> None:
@@ -157,44 +144,42 @@ class StopRequests:
         fault, queued_s = self._fault, self._queued_s
         overdue = self._overdue(now_s)
         if overdue:
-            since_s = min([one.asked_s for one in tuple(self._inside)] + [queued_s or now_s])
-            words = f"{self._device}: {overdue}; {MAY_MOVE}"
-            return (
-                StandingFault(self._device, NoReply.code, words, since_s, f"it is back, and then {UNTIL}"),
-            )
+            since_s = min([one.requested_s for one in tuple(self._inside)] + [queued_s or now_s])
+            message, until = f"{self._device}: {overdue}; {MAY_MOVE}", f"it is back, and then {UNTIL}"
+            return (StandingFault(self._device, NoReply.code, message, since_s, until),)
         return () if fault is None else (fault,)
 
-    def _send(self, asked_s: float, timeout_s: float) -> None:
-        deadline_s = asked_s + timeout_s
+    def _send(self, requested_s: float, timeout_s: float) -> None:
+        deadline_s = requested_s + timeout_s
         beside, alone = False, ""
         with self._changed:
-            self._asked += 1
+            self._count += 1
             self._overdue_s = timeout_s
             if self._queued_s is None:
-                self._thread.submit("stop", self._in_turn, timeout_s, first=True, told=False)
-                self._queued_s = asked_s
-            while self._good_s < asked_s:
+                self._thread.submit("stop", self._in_turn, timeout_s, first=True, noted=False)
+                self._queued_s = requested_s
+            while self._good_s < requested_s:
                 now_s = self._clock.now_s()
-                failed = self._failed is not None and self._failed[0].began_s >= asked_s
+                failed = self._failed is not None and self._failed[0].began_s >= requested_s
                 if failed and self._failed is not None and (self._queued_s is None or now_s >= deadline_s):
                     raise self._failed[1]
                 if now_s >= deadline_s:
-                    words = f"stop did not end within its deadline{alone}; {MAY_MOVE}"
-                    raise NoReply(words, device=self._device)
+                    message = f"stop did not end within its deadline{alone}; {MAY_MOVE}"
+                    raise NoReply(message, device=self._device)
                 again_s = deadline_s
                 if self._queued_s is not None and not beside:
                     began_s = [one.began_s for one in self._inside]
-                    at_s = max(asked_s + self._patience_s, room_s(began_s, timeout_s))
+                    at_s = max(requested_s + self._patience_s, next_try_s(began_s, timeout_s))
                     beside = now_s >= at_s
                     if beside:
-                        alone = self._go_beside(asked_s, timeout_s)
+                        alone = self._go_beside(requested_s, timeout_s)
                         continue
                     again_s = min(deadline_s, at_s)
                 self._changed.wait(again_s - now_s)
 
-    def _go_beside(self, asked_s: float, timeout_s: float) -> str:
-        """Send a stop from a thread of its own; return why that cannot be done. The lock is held."""
-        inside = _Inside(asked_s, self._clock.now_s())
+    def _go_beside(self, requested_s: float, timeout_s: float) -> str:
+        """Send a stop from a thread of its own; return why that cannot be done. The lock is kept."""
+        inside = _Inside(requested_s, self._clock.now_s())
         thread = self._clock.thread(lambda: self._beside(inside, timeout_s), "stop beside")
         self._inside.append(inside)
         try:
@@ -220,60 +205,54 @@ class StopRequests:
         self._into_driver(inside, self._overdue_s)
 
     def _into_driver(self, inside: _Inside, timeout_s: float) -> None:
-        """Make one stop; whoever waits for one is told."""
+        """Make one stop, and wake those that wait for one."""
         error: Exception | None = None
         try:
             self._stop()
         except BaseException as anything:  # a driver from outside may raise what it likes
             error = self._thread.typed("stop", anything)
         ended_s = self._clock.now_s()
-        words = f"{self._device}: a stop asked for {ended_s - inside.asked_s:.1f} s ago "
-        words += "ended only now" if error is None else f"failed only now: {error}"
+        message = f"{self._device}: a stop requested {ended_s - inside.requested_s:.1f} s ago "
+        message += "ended only now" if error is None else f"failed only now: {error}"
         with self._changed:
             self._inside.remove(inside)
             if error is None:
                 self._good_s = ended_s
             else:
                 self._failed = inside, error
-            given_up = self._fault is not None and ended_s > inside.asked_s + timeout_s
+            given_up = self._fault is not None and ended_s > inside.requested_s + timeout_s
             late = given_up or ended_s > inside.began_s + timeout_s
             if late:
                 self._late_s = ended_s
-                self._fault = StandingFault(self._device, NoReply.code, words, inside.asked_s, UNTIL)
+                self._fault = StandingFault(self._device, NoReply.code, message, inside.requested_s, UNTIL)
             self._changed.notify_all()
         if late:
-            log.warning("%s", words)
+            log.warning("%s", message)
         if error is not None:
             raise error
 
     def _overdue(self, now_s: float) -> str:
         """Say which stop has not come back in time; empty if none."""
-        good_s = self._good_s  # who asked before that has been answered, by another stop
+        good_s = self._good_s  # requests before that were answered, by another stop
         waiting_s = [
-            one.asked_s
+            one.requested_s
             for one in tuple(self._inside)
-            if now_s >= (one.began_s if one.asked_s <= good_s else one.asked_s) + self._overdue_s
+            if now_s >= (one.began_s if one.requested_s <= good_s else one.requested_s) + self._overdue_s
         ]
-        return self._told(min(waiting_s), now_s) if waiting_s else ""
+        return self._message(min(waiting_s), now_s) if waiting_s else ""
 
     @staticmethod
-    def _told(asked_s: float, now_s: float) -> str:
-        words = f"a stop asked for {now_s - asked_s:.1f} s ago has not come back from the driver yet"
-        return f"{words}; no move goes out before it has"
+    def _message(requested_s: float, now_s: float) -> str:
+        overdue = f"a stop requested {now_s - requested_s:.1f} s ago has not come back from the driver yet"
+        return f"{overdue}; no move goes out before it has"
 
 
-def room_s(began_s: Sequence[float], timeout_s: float) -> float:
+def next_try_s(began_s: Sequence[float], timeout_s: float) -> float:
     """Return from when on one more stop may go into a driver in which others hang.
 
     The newest one must have hung for its deadline, or for an eighth of the time that the oldest hangs: so the
     number of threads grows with the logarithm of that time, and a stop is never long without its own try.
-
-    Parameters
-    ----------
-    began_s
-        When those inside went in, seconds, in any order.
-    timeout_s
-        The deadline of a stop, seconds.
+    ``began_s`` is when those inside went in, in any order, ``timeout_s`` the deadline of a stop.
     """
     if not began_s:
         return float("-inf")

@@ -1,4 +1,4 @@
-"""What pictures say about motion: did they move as the joints did, are two of one moment, is it repeated?"""
+"""What images say about motion: did they move as the joints did, are two of one moment, is it repeated?"""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from calib.matching.shown_view import Posed, ShownView, ViewLimits, overlap, sho
 from calib.matching.verdict import PatchMatch
 from drivers.errors import BadFrame
 from mastctl.devices.joint_history import HeadReading
-from mastctl.motion.looking import CameraView, Clicked, RigCameras
+from mastctl.devices.keep_out import Pair
 from mastctl.motion.results import PointingError, rounded
-from mastctl.motion.settings import PointingSettings
+from mastctl.motion.views import CameraView, Clicked, RigCameras
 
 LEAST_OVERLAP = 0.15
-"""Less of a picture in common is not worth a picture before the move."""
+"""Less of an image in common is not worth an image before the move."""
 
 
 class MotionSeen:
-    """The last pictures of each head camera during one request, and the new ones against them.
+    """The last images of each head camera during one request, and the new ones against them.
 
-    Only pictures of one request are compared: between two requests the rover may have been driven. The
-    first picture of a camera has nothing before it, and is believed.
+    Only images of one request are compared: between two requests the rover may have been driven. The first
+    image of a camera has nothing before it, and is accepted.
     """
 
     def __init__(self, rig: Rig, limits: ViewLimits) -> None:
@@ -34,56 +34,47 @@ class MotionSeen:
         self._before: dict[str, tuple[Posed, tuple[str, Posed] | None]] = {}
 
     def remember(self, views: Mapping[str, CameraView]) -> None:
-        """Keep pictures of one moment for the next comparison."""
+        """Keep images of one moment for the next comparison."""
         posed = {name: _posed(view) for name, view in views.items() if self._on_head(name)}
-        for name, one in posed.items():
-            other = next((eye for eye in self._pair(name) if eye != name and eye in posed), None)
-            self._before[name] = one, None if other is None else (other, posed[other])
+        for name, image in posed.items():
+            other = next((one for one in self._pair(name) if one != name and one in posed), None)
+            self._before[name] = image, None if other is None else (other, posed[other])
 
-    def lacking(
-        self, cameras: Sequence[str], here_rad: tuple[float, float], goal_rad: tuple[float, float]
-    ) -> list[str]:
-        """Return the head cameras without a picture, of which one before a move will tell something.
+    def lacking(self, cameras: Sequence[str], start_rad: Pair, goal_rad: Pair) -> list[str]:
+        """Return the head cameras without an image, of which one before a move will show something.
 
         None of a move that is smaller than what need not show, or that leaves too little in common.
         """
-        way_rad = max(abs(goal - here) for goal, here in zip(goal_rad, here_rad, strict=True))
+        way_rad = max(abs(goal - start) for goal, start in zip(goal_rad, start_rad, strict=True))
         if way_rad <= self._limits.floor_rad:
             return []
         wanted = [name for name in cameras if self._on_head(name) and name not in self._before]
-        return [name for name in wanted if overlap(self._rig, name, here_rad, goal_rad) >= LEAST_OVERLAP]
+        return [name for name in wanted if overlap(self._rig, name, start_rad, goal_rad) >= LEAST_OVERLAP]
 
     def check(self, views: Mapping[str, CameraView], detail: dict[str, Any]) -> None:
-        """Compare new pictures with the last ones of the same cameras, and keep them instead.
+        """Compare new images of one moment with the last ones of the same cameras, and keep them instead.
 
-        Parameters
-        ----------
-        views
-            New pictures of one moment by camera.
-        detail
-            Of the step: gets ``motion_evidence``, what was seen by camera.
-
-        Raises
-        ------
-        BadFrame
-            If a picture shows another view than the joints say.
+        ``detail`` of the step gets ``motion_evidence``, what was seen by camera. Raises BadFrame if an image
+        shows another view than the joints say.
         """
-        told: dict[str, dict[str, Any]] = {}
-        detail["motion_evidence"] = told
+        evidence: dict[str, dict[str, Any]] = {}
+        detail["motion_evidence"] = evidence
         refused: BadFrame | None = None
         for name, view in views.items():
             if not self._on_head(name):
-                told[name] = {"verdict": "on_body"}
+                evidence[name] = {"verdict": "on_body"}
                 continue
             if name not in self._before:
-                told[name] = {"verdict": "no_picture_before"}
+                evidence[name] = {"verdict": "no_picture_before"}
                 continue
             before, beside = self._before[name]
             after = _posed(view)
             shown = shown_view(self._rig, name, before, after, beside, self._limits)
-            told[name] = as_told(shown)
+            evidence[name] = _facts(shown)
             if shown.verdict in ("contradicted", "unlike"):
-                refused = refused or BadFrame(_words(shown, before, after), device=name, detail=told[name])
+                refused = refused or BadFrame(
+                    _contradiction(shown, before, after), device=name, detail=evidence[name]
+                )
         if refused is not None:
             raise refused
         self.remember(views)
@@ -95,11 +86,11 @@ class MotionSeen:
         return next((pair for pair in self._rig.stereo.values() if name in pair), ())
 
 
-def as_told(shown: ShownView) -> dict[str, Any]:
-    """Return what was seen as it stands in the record; numbers only where a view was found."""
-    told: dict[str, Any] = {"verdict": shown.verdict}
+def _facts(shown: ShownView) -> dict[str, Any]:
+    """What was seen, for the record; numbers only where a view was found."""
+    facts: dict[str, Any] = {"verdict": shown.verdict}
     if np.isfinite(shown.pan_rad):
-        told.update(
+        facts.update(
             pan_rad=round(shown.pan_rad, 6),
             tilt_rad=round(shown.tilt_rad, 6),
             off_rad=_rounded(shown.off_rad),
@@ -107,7 +98,7 @@ def as_told(shown: ShownView) -> dict[str, Any]:
             allowed_rad=_rounded(shown.allowed_rad),
             off_px=round(shown.off_px, 2),
         )
-    return told | {"patches": [shown.agreeing, shown.expected]}
+    return facts | {"patches": [shown.agreeing, shown.expected]}
 
 
 def _posed(view: CameraView) -> Posed:
@@ -118,13 +109,13 @@ def _rounded(values: Sequence[float] | FloatArray) -> list[float]:
     return [round(float(value), 6) for value in values]
 
 
-def _words(shown: ShownView, before: Posed, after: Posed) -> str:
-    """Say what a picture shows instead of what it should."""
-    told = f"pan {after.pan_rad:.3f}, tilt {after.tilt_rad:.3f} rad"
+def _contradiction(shown: ShownView, before: Posed, after: Posed) -> str:
+    """Say what an image shows instead of what it should."""
+    expected = f"pan {after.pan_rad:.3f}, tilt {after.tilt_rad:.3f} rad"
     if shown.verdict == "unlike":
         return (
             f"the picture shows nothing of what {shown.expected} places of the picture before should show at "
-            f"{told}: joints and pictures contradict each other"
+            f"{expected}: joints and pictures contradict each other"
         )
     start, goal = np.array(before.angles_rad), np.array(after.angles_rad)
     seen, way = np.array([shown.pan_rad, shown.tilt_rad]), goal - start
@@ -138,46 +129,42 @@ def _words(shown: ShownView, before: Posed, after: Posed) -> str:
             why = f", one on the way there ({100 * share:.0f} %)"
     return (
         f"the picture shows the view of pan {shown.pan_rad:.3f}, tilt {shown.tilt_rad:.3f} rad{why}, not of "
-        f"{told} ({shown.off_px:.0f} px off): joints and pictures contradict each other"
+        f"{expected} ({shown.off_px:.0f} px off): joints and pictures contradict each other"
     )
 
 
 def check_one_moment(
-    eyes: RigCameras,
-    settings: PointingSettings,
+    cameras: RigCameras,
     view: CameraView,
     pixel_px: FloatArray,
     others: Sequence[CameraView],
     resting: HeadReading,
 ) -> dict[str, Any]:
-    """Check that the thing at a pixel moves by less than half a pixel between the exposures of several eyes.
+    """Check that the thing at a pixel moves by less than half a pixel between exposures of several cameras.
 
-    Where these were not at one moment, its speed is measured in a further picture of the first eye, in the
-    picture itself: the mast and the target count alike. That the head reports no motion is checked before
+    Where these were not at one moment, its speed is measured in a further image of the first camera, in the
+    image itself: the mast and the target count alike. That the head reports no motion is checked before
     (`RigCameras.new`).
 
     Returns
     -------
     detail
-        For the record: ``dt_s`` by other eye, and ``image_speed_px_per_s``, ``moved_px`` where measured.
+        For the record: ``dt_s`` by other camera, and ``image_speed_px_per_s``, ``moved_px`` where measured.
 
-    Raises
-    ------
-    PointingError
-        ``target_moving`` if it moves too far, or is not found where it was.
-    DriverError
-        If the further picture does not come.
+    Raises PointingError ``target_moving`` if it moves too far, or is not found where it was; DriverError if
+    the further image does not come.
     """
+    settings = cameras.settings
     detail = apart(view, others)
     moments_s = (0.0, *detail["dt_s"].values())
     spread_s = max(moments_s) - min(moments_s)
     if spread_s <= settings.same_moment_s:
         return detail
     camera = view.frame.camera
-    later = eyes.new((camera,), view.frame.exposure_began_s, resting)[camera]
+    later = cameras.new((camera,), view.frame.exposure_began_s, resting)[camera]
     between_s = later.frame.exposure_began_s - view.frame.exposure_began_s
     try:
-        seen = eyes.again(view, pixel_px, later)
+        seen = cameras.again(view, pixel_px, later)
     except PointingError as error:
         raise PointingError(
             "target_moving",
@@ -187,17 +174,18 @@ def check_one_moment(
     speed = float(np.linalg.norm(seen.pixel_px - pixel_px)) / between_s
     moved_px = speed * spread_s
     detail.update(image_speed_px_per_s=round(speed, 3), moved_px=round(moved_px, 4))
-    if moved_px >= settings.between_eyes_px:
+    if moved_px >= settings.between_cameras_px:
         raise PointingError(
             "target_moving",
             f"the target moves at {speed:.1f} px/s in {camera}, {moved_px:.2f} px between exposures "
-            f"{1e3 * spread_s:.1f} ms apart; less than {settings.between_eyes_px:g} px serves a measurement",
+            f"{1e3 * spread_s:.1f} ms apart; less than {settings.between_cameras_px:g} px serves a "
+            "measurement",
         )
     return detail
 
 
 def apart(view: CameraView, others: Sequence[CameraView]) -> dict[str, Any]:
-    """Return ``dt_s`` for the record: how much later than the first eye each other one began to expose."""
+    """Return ``dt_s`` for the record: how much later than the first camera each other began to expose."""
     begun_s = view.frame.exposure_began_s
     return {"dt_s": {o.frame.camera: round(o.frame.exposure_began_s - begun_s, 6) for o in others}}
 
@@ -206,47 +194,37 @@ SIGMAS = 3.0
 
 
 def repeated(
-    eyes: RigCameras,
-    settings: PointingSettings,
+    cameras: RigCameras,
     clicked: Clicked,
     first: CameraView,
     seen: PatchMatch,
     settled: HeadReading,
 ) -> tuple[CameraView, PatchMatch, dict[str, Any]]:
-    """Find the clicked thing in a later picture of the same camera, where the first one showed it.
+    """Find the clicked thing in a later image of the same camera, where the first one showed it.
 
-    Parameters
-    ----------
-    clicked
-        What is looked for.
-    first, seen
-        The first picture after the move, and where that shows it.
-    settled
-        The head when it had come to rest.
+    ``first`` and ``seen`` are the first image after the move, and where that shows it; ``settled`` is the
+    head when it had come to rest.
 
     Returns
     -------
     later, again, proven
-        The later picture, where that shows it, and for the record ``repeated_after_s``, ``apart_px`` (x, y)
-        and ``fresh_to_s``: pictures older than their stamps by up to that, seconds, would not have passed. 0
+        The later image, where that shows it, and for the record ``repeated_after_s``, ``apart_px`` (x, y)
+        and ``fresh_to_s``: images older than their stamps by up to that, seconds, would not have passed. 0
         where both are the same to the last bit, as of a camera that froze or of a replay.
 
-    Raises
-    ------
-    PointingError
-        ``not_repeated`` if it is elsewhere by more than three sigma and what the joints read between the two
-        (a head at rest may dither by some counts), or not found.
-    DriverError
-        If the picture does not come.
+    Raises PointingError ``not_repeated`` if it is elsewhere by more than three sigma and what the joints read
+    between the two (a head at rest may dither by some counts), or not found; DriverError if the image does
+    not come.
     """
+    settings = cameras.settings
     camera, begun_s = first.frame.camera, first.frame.exposure_began_s
-    later = eyes.new((camera,), begun_s + settings.repeat_after_s, settled)[camera]
+    later = cameras.new((camera,), begun_s + settings.repeat_after_s, settled)[camera]
     after_s = later.frame.exposure_began_s - begun_s
     try:
-        again = eyes.look_for(clicked, later)
+        again = cameras.look_for(clicked, later)
     except PointingError as error:
-        words = f"{after_s:.2f} s later {camera} does not see the target any more: {error}"
-        raise PointingError("not_repeated", words) from None
+        message = f"{after_s:.2f} s later {camera} does not see the target any more: {error}"
+        raise PointingError("not_repeated", message) from None
     apart_px = again.pixel_px - seen.pixel_px
     before_px, after_px = (view.camera.project(clicked.plane.point_m)[0] for view in (first, later))
     allowed_px = SIGMAS * np.hypot(seen.sigma_px, again.sigma_px) + np.abs(after_px - before_px)

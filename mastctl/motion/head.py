@@ -5,25 +5,24 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
-from typing import Protocol, TypeVar
+from contextlib import AbstractContextManager
+from typing import Protocol
 
 from calib.geometry.solutions import Solution, ordered
 from drivers.clock import Clock
+from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading, RestWatch
 from mastctl.devices.keep_out import KeptOut, Pair
 from mastctl.devices.limits import Limits
 from mastctl.motion.results import PointingError
 from mastctl.motion.settings import PointingSettings
 
-T = TypeVar("T")
-
 WATCHED_S = 0.05
 """How often a head at rest is read while a moment is waited for; a stop is noticed as soon."""
 
 
-class SteeredHeadLike(Protocol):
-    """What of `mastctl.devices.devices.Devices` moves the head."""
+class DevicesLike(Protocol):
+    """What of `mastctl.devices.devices.Devices` a pointing needs."""
 
     def read(self) -> HeadReading: ...
     @property
@@ -33,7 +32,17 @@ class SteeredHeadLike(Protocol):
     def goal(self, true_rad: Pair, here: HeadReading) -> Pair: ...
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None: ...
     def stop(self) -> None: ...
-    def check_from(self, here: Pair, goal: Pair) -> None: ...
+    def check_from(self, start: Pair, goal: Pair) -> None: ...
+    def frames(
+        self,
+        cameras: Sequence[str],
+        exposed_after_s: float,
+        timeout_s: float,
+        check: Callable[[], None] = ...,
+    ) -> dict[str, StampedFrame]: ...
+    def newest_frames(self) -> Mapping[str, StampedFrame | None]: ...
+    def frame_by_id(self, frame_id: str) -> StampedFrame: ...
+    def exposure_held(self) -> AbstractContextManager[None]: ...
 
 
 class SteeredHead:
@@ -47,19 +56,19 @@ class SteeredHead:
 
     def __init__(
         self,
-        head: SteeredHeadLike,
+        devices: DevicesLike,
         limits: Limits,
         clock: Clock,
         settings: PointingSettings,
         cancelled: threading.Event,
     ) -> None:
-        self._head = head
+        self._head = devices
         self._limits = limits
         self._clock = clock
         self._settings = settings
         self._cancelled = cancelled
         self._last: HeadReading | None = None
-        self._goal: tuple[float, float] | None = None
+        self._goal: Pair | None = None
 
     def check_not_stopped(self) -> None:
         """Pass unless the request was cancelled. Raises PointingError ``stopped``."""
@@ -69,56 +78,37 @@ class SteeredHead:
     def resting(self) -> HeadReading:
         """Return the reading of a head that rests now.
 
-        Raises
-        ------
-        PointingError
-            ``head_moving`` if it still moves after ``rest_wait_s``; else as for a reading.
-        DriverError
-            If the head does not answer.
+        Raises PointingError ``head_moving`` if it still moves after ``rest_wait_s``; else as `read`.
         """
         watch = RestWatch(0.0, self._settings.rest_tolerance_rad)
         settled, last = self._rests(watch, self._clock.now_s() + self._settings.rest_wait_s)
         if not settled:
-            words = f"the head still moves after {self._settings.rest_wait_s:g} s of waiting"
-            raise PointingError("head_moving", f"{words}: {watch.seen()}")
+            message = f"the head still moves after {self._settings.rest_wait_s:g} s of waiting"
+            raise PointingError("head_moving", f"{message}: {watch.seen()}")
         return last
 
     def time_allowed_s(self, pan_rad: float, tilt_rad: float) -> float:
         """Return the deadline of a move to these angles: distance over speed, ramps, dwell, margin."""
-        here = self.read()
-        distance = max(abs(pan_rad - here.pan_rad), abs(tilt_rad - here.tilt_rad))
-        settings = self._settings
-        return (
-            distance / self._limits.speed_rad_per_s
-            + settings.acceleration_s
-            + settings.dwell_s
-            + settings.margin_s
-        )
+        now, settings = self.read(), self._settings
+        distance = max(abs(pan_rad - now.pan_rad), abs(tilt_rad - now.tilt_rad))
+        rest_s = settings.acceleration_s + settings.dwell_s + settings.margin_s
+        return distance / self._limits.speed_rad_per_s + rest_s
 
     def check_goal(self, pan_rad: float, tilt_rad: float) -> None:
         """Pass angles to which the head may be sent from where it rests.
 
-        Raises
-        ------
-        OutsideLimits, KeptOut
-            If they may not be commanded, or the move may pass a keep-out.
-        PointingError, DriverError
-            As for a reading.
+        Raises OutsideLimits, KeptOut if they may not be commanded, or the move may pass a keep-out.
         """
-        here = self.read()
-        self._head.check_from((here.pan_rad, here.tilt_rad), (pan_rad, tilt_rad))
+        now = self.read()
+        self._head.check_from((now.pan_rad, now.tilt_rad), (pan_rad, tilt_rad))
 
-    def chosen(self, solutions: Sequence[Solution], here: HeadReading) -> Solution:
-        """Return the one of several true joint angles that is taken from ``here``; raises as `reached`."""
+    def chosen(self, solutions: Sequence[Solution], start: HeadReading) -> Solution:
+        """Return the one of several true joint angles that is taken from a start; raises as `reached`."""
 
         def read(one: Solution) -> Pair:
-            return self.goal((one.pan_rad, one.tilt_rad), here)
+            return self._head.goal((one.pan_rad, one.tilt_rad), start)
 
-        return reached(solutions, self._limits, self._head.check_from, (here.pan_rad, here.tilt_rad), read)
-
-    def goal(self, true_rad: Pair, here: HeadReading) -> Pair:
-        """Return the readings to send the head to, so that it comes to true angles."""
-        return self._head.goal(true_rad, here)
+        return reached(solutions, self._limits, self._head.check_from, (start.pan_rad, start.tilt_rad), read)
 
     def send(self, pan_rad: float, tilt_rad: float) -> None:
         """Start the move at the speed cap. Raises OutsideLimits, Stopped, DriverError."""
@@ -129,13 +119,8 @@ class SteeredHead:
     def arrived(self, pan_rad: float, tilt_rad: float, deadline_s: float) -> HeadReading:
         """Wait until the head rests at these angles and return the reading.
 
-        Raises
-        ------
-        PointingError
-            ``did_not_arrive`` with how far it is off, ``did_not_settle`` if it never rests before the
-            deadline (clock time, seconds), ``stopped``; else as for a reading.
-        DriverError
-            If the head does not answer.
+        Raises PointingError ``did_not_arrive`` with how far it is off, ``did_not_settle`` if it never rests
+        before the deadline (clock time, seconds), ``stopped``; else as `read`.
         """
         tolerance = self._settings.arrival_tolerance_rad
         watch = RestWatch(self._settings.dwell_s, self._settings.rest_tolerance_rad)
@@ -149,19 +134,14 @@ class SteeredHead:
                 continue  # a head that rests elsewhere may not have started yet
             where = f"pan {off[0]:+.4f} rad and tilt {off[1]:+.4f} rad from the commanded angles"
             if max(map(abs, off)) > tolerance:
-                words = f"at its deadline the head is {where}, at most {tolerance:g} rad is expected"
-                raise PointingError("did_not_arrive", words)
-            words = f"at its deadline the head still moves, {where}: {watch.seen()}"
-            raise PointingError("did_not_settle", words)
+                message = f"at its deadline the head is {where}, at most {tolerance:g} rad is expected"
+                raise PointingError("did_not_arrive", message)
+            raise PointingError(
+                "did_not_settle", f"at its deadline the head still moves, {where}: {watch.seen()}"
+            )
 
     def watch_until(self, until_s: float) -> None:
-        """Read the head until a moment, clock time in seconds.
-
-        Raises
-        ------
-        PointingError, DriverError
-            ``stopped``; else as for a reading.
-        """
+        """Read the head until a moment, clock time in seconds. Raises PointingError ``stopped``."""
         while (left_s := until_s - self._clock.now_s()) > 0.0:
             self.check_not_stopped()
             self.read()
@@ -170,28 +150,22 @@ class SteeredHead:
     def read(self) -> HeadReading:
         """Return a reading that can be true.
 
-        Raises
-        ------
-        PointingError
-            ``bad_reading`` or ``head_fault``.
-        DriverError
-            If the head does not answer.
+        Raises PointingError ``bad_reading`` or ``head_fault``; DriverError if the head does not answer.
         """
         reading, before = self._head.read(), self._last
         if self._clock.now_s() - reading.time_s > self._settings.reading_age_s:
             reading = self._head.read()  # a process that got no processor meanwhile is no fault of the head
-        now_s = self._clock.now_s()
+        age_s = self._clock.now_s() - reading.time_s
         if not all(map(math.isfinite, (reading.pan_rad, reading.tilt_rad, reading.time_s))):
-            words = f"the head reads pan {reading.pan_rad}, tilt {reading.tilt_rad}"
-            words += "" if math.isfinite(reading.time_s) else f" at {reading.time_s} s"
-            raise PointingError("bad_reading", f"{words}: not finite numbers")
+            message = f"the head reads pan {reading.pan_rad}, tilt {reading.tilt_rad}"
+            message += "" if math.isfinite(reading.time_s) else f" at {reading.time_s} s"
+            raise PointingError("bad_reading", f"{message}: not finite numbers")
         if reading.faults:
             raise PointingError("head_fault", f"the head reports: {'; '.join(reading.faults)}")
-        if now_s - reading.time_s > self._settings.reading_age_s:
-            words = f"the head's reading is {now_s - reading.time_s:.2f} s old"
-            raise PointingError(
-                "bad_reading", f"{words}, at most {self._settings.reading_age_s:g} s is taken"
-            )
+        most_s = self._settings.reading_age_s
+        if age_s > most_s:
+            message = f"the head's reading is {age_s:.2f} s old, at most {most_s:g} s is taken"
+            raise PointingError("bad_reading", message)
         if before is not None:
             passed_s = reading.time_s - before.time_s
             if passed_s < 0:
@@ -203,8 +177,8 @@ class SteeredHead:
                 _outside(reading.tilt_rad, before.tilt_rad, goal[1]),
             )
             if jump > reach:
-                words = f"the head's reading jumped {jump:.3f} rad off its way in {passed_s:.3f} s"
-                raise PointingError("bad_reading", f"{words}, at most {reach:.3f} rad is possible")
+                message = f"the head's reading jumped {jump:.3f} rad off its way in {passed_s:.3f} s"
+                raise PointingError("bad_reading", f"{message}, at most {reach:.3f} rad is possible")
         self._last = reading
         return reading
 
@@ -229,7 +203,7 @@ def reached(
     solutions: Sequence[Solution],
     limits: Limits,
     check_from: Callable[[Pair, Pair], None],
-    here: Pair,
+    start: Pair,
     read: Callable[[Solution], Pair],
 ) -> Solution:
     """Return the solution to take, of those that no keep-out bars: upright ones first, then the nearest.
@@ -242,60 +216,21 @@ def reached(
         Of the joints: an angle is taken whole turns away too, where a cable lets the pan turn so far.
     check_from
         Raises KeptOut where a move from one pose to another, in readings, may not be sent.
-    here
+    start
         Where the head rests, as read.
     read
-        The readings to send the head to, so that it comes to a solution's true angles.
+        Returns the readings to send the head to, so that it comes to a solution's true angles.
 
-    Raises
-    ------
-    Unreachable
-        If none lies within the limits.
-    KeptOut
-        If keep-outs bar all that do; of the one that would have been taken.
+    Raises Unreachable if none lies within the limits; KeptOut if keep-outs bar all that do; of the one that
+    would have been taken.
     """
     refused: KeptOut | None = None
-    for one in ordered(solutions, limits.pan_rad, limits.tilt_rad, *here, read):
+    for one in ordered(solutions, limits.pan_rad, limits.tilt_rad, *start, read):
         try:
-            check_from(here, read(one))
+            check_from(start, read(one))
         except KeptOut as error:
             refused = refused or error
         else:
             return one
     assert refused is not None
     raise refused
-
-
-LOOKED_S = 0.02  # how late a stop may be noticed
-
-
-def result_unless(stopped: Callable[[], None], work: Callable[[], T], clock: Clock) -> T:
-    """Return what ``work()`` returns; it runs in a thread of its own.
-
-    Only for work that moves nothing: when ``stopped()`` raises, that is raised, and the work goes on to its
-    end with nobody to take its result. ``clock`` is one that goes on while somebody waits.
-
-    Raises
-    ------
-    BaseException
-        Whatever ``work`` or ``stopped`` raises.
-    """
-    future: Future[T] = Future()
-    ended = clock.signal()
-
-    def run() -> None:
-        try:
-            future.set_result(work())
-        except BaseException as error:  # it belongs to who waits
-            future.set_exception(error)
-        with ended:
-            ended.notify_all()
-
-    clock.thread(run, "operation's work").start()
-    while True:
-        with ended:
-            if not future.done():
-                ended.wait(LOOKED_S)
-        if future.done():
-            return future.result()
-        stopped()

@@ -1,4 +1,4 @@
-"""Pointing with one camera: how far the clicked thing is was told, follows from a plane, or is not known.
+"""Pointing with one camera: how far the clicked thing is was given, follows from a plane, or is not known.
 
 What is not known is counted with (`calib.geometry.line_of_sight`): between
 `PointingSettings.unknown_nearest_m` and infinity at first, and less after each view from elsewhere that shows
@@ -28,33 +28,25 @@ from calib.geometry.rigid import FloatArray
 from calib.matching.verdict import PatchMatch
 from calib.matching.warp import Plane, facing_plane
 from mastctl.devices.keep_out import Pair
-from mastctl.motion.looking import CameraView, Clicked
 from mastctl.motion.requests import PointRequest
 from mastctl.motion.results import PointingError, rounded
 from mastctl.motion.settings import PointingSettings
 from mastctl.motion.steps import FoundAgain
+from mastctl.motion.views import CameraView, Clicked
 
 RangeFrom = Literal["given", "plane", "parallax", "unknown"]
 TRIED_SIGMAS = (1.0, -1.0, 2.0)
-"""Beside the likeliest range, where a thing of unknown range is looked for: nearer, farther, nearer still."""
-TOLD_SHARE = 0.5
-"""Parallax has told a range when it left less than this part of the sigma that nothing else leaves."""
+"""Beside the likeliest range, where a thing of unknown range is searched: nearer, farther, nearer still."""
+KNOWN_SHARE = 0.5
+"""Parallax has shown a range when it left less than this part of the sigma that nothing else leaves."""
 
 
 class OneCamera:
     """What one camera knows of a target during one request.
 
-    Attributes
-    ----------
-    sight
-        The newest line of sight, with its range.
-    range_from
-        What says how far the target is.
+    ``sight``: the newest line of sight, with its range; ``range_from``: what says how far the target is.
 
-    Raises
-    ------
-    CalibError
-        If the clicked pixel does not meet the plane that it is told to lie in, or has no ray.
+    Raises CalibError if the clicked pixel does not meet the plane that it is said to lie in, or has no ray.
     """
 
     def __init__(
@@ -83,14 +75,9 @@ class OneCamera:
         """The likeliest place of the target, (3,), rover frame."""
         return self.sight.position_m(self._rig)
 
-    @property
-    def range_interval_m(self) -> tuple[float, float | None]:
-        """Where the range lies in 95 of 100 cases, from the camera that saw the target last."""
-        return self.sight.range_interval_m
-
-    def told(self) -> Mapping[str, Any]:
-        """What is known of the range, for a step's detail."""
-        near, far = self.range_interval_m
+    def facts(self) -> Mapping[str, Any]:
+        """Return what is known of the range, for a step's detail."""
+        near, far = self.sight.range_interval_m
         return {
             "range_from": self.range_from,
             "range_m": round(self.sight.range_m, 5),
@@ -127,10 +114,7 @@ class OneCamera:
     def check(self, now: CameraView, seen: PatchMatch, expected: SeenFrom) -> dict[str, float]:
         """Pass a match that lies where the range can put it; return how far off, for the record.
 
-        Raises
-        ------
-        PointingError
-            ``off_the_line``.
+        Raises PointingError ``off_the_line``.
         """
         reach = NORMAL_95 * 1.5 * self.sight.inverse_sigma_m
         low, high = max(-reach, -self.sight.inverse_m), reach
@@ -140,7 +124,7 @@ class OneCamera:
         beside_px = float(np.linalg.norm(off - at * along))
         model = now.camera
         focal_px = model.focal_px[0]
-        most_px = self._settings.eyes_px + self._settings.view.floor_rad * focal_px
+        most_px = self._settings.across_px + self._settings.view.floor_rad * focal_px
         if beside_px > most_px:
             raise PointingError(
                 "off_the_line",
@@ -155,5 +139,5 @@ class OneCamera:
         self.sight = shown(
             self._rig, before, now.frame.camera, now.frame.true_rad, pixel_px, expected, sigma_px
         )
-        if self.range_from == "unknown" and self.sight.inverse_sigma_m < TOLD_SHARE * self._unknown[1]:
+        if self.range_from == "unknown" and self.sight.inverse_sigma_m < KNOWN_SHARE * self._unknown[1]:
             self.range_from = "parallax"

@@ -1,4 +1,4 @@
-"""Which pair of cameras looks at a target, and the record of a hand-off from one to the next."""
+"""Which pair of cameras serves for a target, and the record of a hand-off from one to the next."""
 
 from __future__ import annotations
 
@@ -23,32 +23,32 @@ from calib.matching.handoff import RefineSettings, refine_handoff
 from calib.matching.verdict import PatchMatch
 from mastctl.devices.keep_out import KeptOut
 from mastctl.devices.limits import Limits
-from mastctl.motion.looking import CameraView
 from mastctl.motion.settings import HandoffRules
+from mastctl.motion.views import CameraView
 
 Chosen = Callable[[Sequence[Solution]], Solution]
 
 CENTRING_STEPS = 3
-"""Each solves exactly for one eye; the other eye's place follows within a pixel after two."""
+"""Each solves exactly for one camera; the place in the other follows within a pixel after two."""
 
 
 @dataclass(frozen=True)
 class PairChoice:
-    """A pair that can look at a target.
+    """A pair that sees a target.
 
     Attributes
     ----------
     pair
         Its name.
     pan_rad, tilt_rad
-        True joint angles that bring the target midway between the two pictures' middles; None for a pair on
-        the body, which looks wherever the head is.
+        True joint angles that bring the target midway between the two images' middles; None for a pair on
+        the body, which the head does not turn.
     range_m
         From the middle between the pair's cameras.
     range_error_m
         By eqs. (1) and (2), 3 sigma.
     outside
-        Which bounds are broken, in words; empty for a pair that keeps them all.
+        Which bounds are broken, in sentences; empty for a pair that keeps them all.
     """
 
     pair: str
@@ -67,15 +67,13 @@ def choose_pairs(
     from_rad: tuple[float, float] = (0.0, 0.0),
     chosen: Chosen | None = None,
 ) -> list[PairChoice]:
-    """Return the pairs that can look at a position, the one that should first.
+    """Return the pairs that see a position, the one that should take images first.
 
     Pairs that keep their bounds come first, the most accurate in front. Then those that see the target but
     break a bound, the shortest focal length in front: they serve where no other does.
 
     Parameters
     ----------
-    rig
-        Mast, cameras and pairs.
     position_m
         (3,) the target in the rover frame.
     limits
@@ -85,10 +83,7 @@ def choose_pairs(
     chosen
         Chooses among them in place of ``limits``.
 
-    Raises
-    ------
-    CalibError
-        If no pair has the target well inside both pictures, with the reason for each.
+    Raises CalibError if no pair has the target well inside both images, with the reason for each.
     """
     rules = rules or HandoffRules()
 
@@ -101,7 +96,7 @@ def choose_pairs(
     reasons: list[str] = []
     for name in rig.stereo:
         try:
-            focal_px, choice = _looked_at(rig, name, position_m, rules, choose_one, from_rad)
+            focal_px, choice = _choice_of(rig, name, position_m, rules, choose_one, from_rad)
         except (CalibError, KeptOut) as error:
             reasons.append(f"{name}: {error}")
             continue
@@ -111,12 +106,12 @@ def choose_pairs(
     found = [choice for _, choice in (*kept, *broken)]
     if not found:
         place = ", ".join(f"{value:.2f}" for value in position_m)
-        words = "; ".join(reasons) or "none is configured with both cameras"
-        raise CalibError(f"no stereo pair sees the target at ({place}) m: {words}")
+        why = "; ".join(reasons) or "none is configured with both cameras"
+        raise CalibError(f"no stereo pair sees the target at ({place}) m: {why}")
     return found
 
 
-def _looked_at(
+def _choice_of(
     rig: Rig,
     name: str,
     position_m: FloatArray,
@@ -124,14 +119,14 @@ def _looked_at(
     chosen: Chosen,
     from_rad: tuple[float, float],
 ) -> tuple[float, PairChoice]:
-    """One pair's focal length and how it would look. Raises CalibError if it cannot."""
-    eyes = rig.stereo[name]
+    """One pair's focal length and how it would see the position. Raises CalibError if it cannot."""
+    cameras = rig.stereo[name]
     angles = None
-    if rig.cameras[eyes[0]].on == "head":
-        angles = _centred(rig, eyes, position_m, chosen, from_rad)
-    left, right = (rig.camera_in_rover(eye, *(angles or (0.0, 0.0))) for eye in eyes)
-    for eye, model in zip(eyes, (left, right), strict=True):
-        _check_in_limits(eye, model, position_m, rules.margin_px)
+    if rig.cameras[cameras[0]].on == "head":
+        angles = _centred(rig, cameras, position_m, chosen, from_rad)
+    left, right = (rig.camera_in_rover(camera, *(angles or (0.0, 0.0))) for camera in cameras)
+    for camera, model in zip(cameras, (left, right), strict=True):
+        _check_in_image(camera, model, position_m, rules.margin_px)
     between = position_m - (left.C + right.C) / 2
     range_m = float(np.linalg.norm(between))
     steep_rad = math.asin(float(between[2]) / range_m)
@@ -152,16 +147,16 @@ def _looked_at(
 
 def _centred(
     rig: Rig,
-    eyes: tuple[str, str],
+    cameras: tuple[str, str],
     position_m: FloatArray,
     chosen: Chosen,
     from_rad: tuple[float, float],
 ) -> tuple[float, float]:
-    """Joint angles that put the target as far from the middle in the one eye as in the other.
+    """Joint angles that put the target as far from the middle in the one camera as in the other.
 
-    In the middle of one eye alone a near target may be outside the other's picture. Raises CalibError.
+    In the middle of one camera alone a near target may be outside the other's image. Raises CalibError.
     """
-    left, right = (rig.cameras[eye].model for eye in eyes)
+    left, right = (rig.cameras[camera].model for camera in cameras)
     middle = np.array(left.image_center_px)
     aim = middle.copy()
     pan_rad, tilt_rad = from_rad
@@ -171,29 +166,29 @@ def _centred(
         )
         best = chosen(solutions)
         pan_rad, tilt_rad = best.pan_rad, best.tilt_rad
-        in_right, seen = rig.camera_in_rover(eyes[1], pan_rad, tilt_rad).project(position_m)
+        in_right, seen = rig.camera_in_rover(cameras[1], pan_rad, tilt_rad).project(position_m)
         if not bool(seen):
-            break  # the check of both pictures says so
+            break  # the check of both images says so
         off = (np.array(right.image_center_px) - in_right - (aim - middle)) / 2
         aim = np.clip(aim + off, 0.0, np.array(left.size_px) - 1.0)
     return pan_rad, tilt_rad
 
 
-def _check_in_limits(eye: str, model: CameraModel, position_m: FloatArray, margin_px: float) -> None:
-    """Pass a camera that has a position well inside its picture. Raises CalibError."""
+def _check_in_image(camera: str, model: CameraModel, position_m: FloatArray, margin_px: float) -> None:
+    """Pass a camera that has a position well inside its image. Raises CalibError."""
     pixel, seen = model.project(position_m)
     if not bool(seen):
-        raise CalibError(f"{eye} has it behind itself or beyond what its lens images")
+        raise CalibError(f"{camera} has it behind itself or beyond what its lens images")
     if not model.holds(pixel, margin_px):
         width, height = model.size_px
         raise CalibError(
-            f"{eye} has it at pixel ({pixel[0]:.0f}, {pixel[1]:.0f}), not {margin_px:g} px inside its "
+            f"{camera} has it at pixel ({pixel[0]:.0f}, {pixel[1]:.0f}), not {margin_px:g} px inside its "
             f"{width}x{height} px"
         )
 
 
 JOINT_SIGMA_RAD = 3e-5
-"""What a joint reading is taken to be wrong by: half a step of a stepped pan/tilt unit."""
+"""What a joint reading is assumed to be wrong by: half a step of a stepped pan/tilt unit."""
 LEAST_SIGMA_PX = 0.05
 HANDOFF_SETTINGS = RefineSettings(least_px=6.0, model_px=1.0)
 """Two sets of cameras may mean rover frames that are 5 mrad apart, the paper's bias of 2 px in a Hazcam: wide
@@ -204,21 +199,10 @@ def record_of(
     rig: Rig, pair: tuple[str, str], views: Mapping[str, CameraView], found: Mapping[str, PatchMatch],
     to: Mapping[str, CameraView],
 ) -> MatchedHandoff | str:  # fmt: skip
-    """Return the record of a target that was found by one pair and is looked up in another's pictures.
+    """Return the record of a target that one pair found, in another's images, or why there is none.
 
-    Parameters
-    ----------
-    rig
-        The mast file in use.
-    pair, views, found
-        The former pair, left camera first, its pictures, and where the target was found in them.
-    to
-        Pictures of the next pair.
-
-    Returns
-    -------
-    record
-        Or why there is none, in one sentence.
+    ``pair``, ``views`` and ``found`` are the former pair, left camera first, its images, and where the target
+    was found in them; ``to`` the images of the next pair.
     """
     if not to or any(name not in found or found[name].verdict != "good" for name in pair):
         return (
@@ -250,12 +234,8 @@ LEAST_ELLIPSE_PX = 0.05
 def in_picture(camera: CameraModel, position_m: ArrayLike, covariance_m2: object) -> dict[str, float] | None:
     """Return the pixel of a point and one sigma of it as an ellipse.
 
-    Parameters
-    ----------
-    camera
-        In the frame of the point.
-    position_m, covariance_m2
-        (3,) metres and (3, 3) m²; None for a point whose covariance is not known: then the ellipse is none.
+    ``camera``: in the frame of the point; ``position_m``, ``covariance_m2``: (3,) metres and (3, 3) m²; None
+    for a point whose covariance is not known: then the ellipse is none.
 
     Returns
     -------
@@ -266,11 +246,11 @@ def in_picture(camera: CameraModel, position_m: ArrayLike, covariance_m2: object
     place, rates, valid = camera.project_jacobian(position_m)
     if not bool(valid) or not camera.holds(place):
         return None
-    told = {"x_px": float(place[0]), "y_px": float(place[1])}
+    ellipse = {"x_px": float(place[0]), "y_px": float(place[1])}
     if covariance_m2 is None:
-        return told | {"major_px": 0.0, "minor_px": 0.0, "turn_rad": 0.0}
+        return ellipse | {"major_px": 0.0, "minor_px": 0.0, "turn_rad": 0.0}
     variances, axes = np.linalg.eigh(rates @ np.asarray(covariance_m2, dtype=float) @ rates.T)
     minor, major = (max(LEAST_ELLIPSE_PX, math.sqrt(max(0.0, one))) for one in variances.tolist())
-    return told | {
+    return ellipse | {
         "major_px": major, "minor_px": minor, "turn_rad": math.atan2(axes[1, 1], axes[0, 1])
     }  # fmt: skip

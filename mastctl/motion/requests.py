@@ -1,17 +1,20 @@
-"""What may be pointed at, and a request judged before anything moves."""
+"""What may be pointed at or followed, and a request judged before anything moves."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import ConfigDict, Field
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from calib.geometry.rig import Rig
+from mastctl.control.entry import LONGEST_DEADLINE_S
 from mastctl.devices.frames import StampedFrame, check_known
 from mastctl.errors import BadRequest, NotNow
+from mastctl.motion.poses import RoverPose
 
 CHECKED = ConfigDict(extra="forbid", allow_inf_nan=False)
 """Unknown keys and numbers that are not finite are refused, and by the types below what only looks right."""
@@ -21,10 +24,17 @@ LARGEST_M = 1e6
 Name = Annotated[str, Field(strict=True, min_length=1, max_length=200)]
 Pixel = Annotated[float, Field(strict=True, ge=-LARGEST_PX, le=LARGEST_PX)]
 Metres = Annotated[float, Field(strict=True, ge=-LARGEST_M, le=LARGEST_M)]
+Place = Annotated[list[Metres], Field(min_length=3, max_length=3)]
 Angle = Annotated[float, Field(strict=True, ge=-2 * math.pi, le=2 * math.pi)]
-Coordinate = Annotated[float, Field(strict=True)]  # a bounded position, carried on by a bounded pose
 Range = Annotated[float, Field(strict=True, ge=0.01, le=1e5)]
 Pointings = Annotated[int, Field(strict=True, ge=1, le=2)]
+DeadlineS = Annotated[float, Field(gt=0.0, le=LONGEST_DEADLINE_S, allow_inf_nan=False)]
+
+
+class StrictBody(BaseModel):
+    """Unknown keys, wrong types and numbers that are not finite are refused."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
 
 @dataclass(frozen=True, config=CHECKED)
@@ -36,22 +46,6 @@ class PixelTarget:
     x_px: Pixel
     y_px: Pixel
     mast_digest: Name | None = None
-
-
-@dataclass(frozen=True, config=CHECKED)
-class PositionTarget:
-    """A point (3,), metres, in the ``rover`` or ``site`` frame; the two are one before the first pose."""
-
-    position_m: tuple[Coordinate, Coordinate, Coordinate]
-    frame: Literal["rover", "site"] = "rover"
-
-
-@dataclass(frozen=True, config=CHECKED)
-class AnglesTarget:
-    """Joint angles, radians."""
-
-    pan_rad: Angle
-    tilt_rad: Angle
 
 
 @dataclass(frozen=True, config=CHECKED)
@@ -69,9 +63,6 @@ class PlaneTarget:
             raise ValueError("normal has no direction; expected a vector at right angles to the plane")
 
 
-Target = PixelTarget | PositionTarget | AnglesTarget
-
-
 @dataclass(frozen=True, config=CHECKED)
 class Aim:
     """The pixel of a head camera on which the target is wanted."""
@@ -81,71 +72,113 @@ class Aim:
     y_px: Pixel
 
 
-@dataclass(frozen=True, config=CHECKED)
-class PointRequest:
-    """Point at a target.
+class TrackRequest(StrictBody):
+    """``POST /track``: exactly one of pixel and position_m.
+
+    ``position_m`` is (3,), in the ``rover`` (default) or ``site`` frame; the two are one before the first
+    pose.
+    """
+
+    deadline_s: DeadlineS | None = None
+    pixel: PixelTarget | None = None
+    position_m: Place | None = None
+    frame: Literal["rover", "site"] | None = None
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        if self.frame is not None and self.position_m is None:
+            raise ValueError("frame goes with position_m only")
+        self._check_targets()
+        return self
+
+    def _check_targets(self) -> None:
+        """Pass exactly one target. Raises ValueError."""
+        if (self.pixel is None) == (self.position_m is None):
+            raise ValueError("exactly one of pixel and position_m is expected")
+
+    def in_rover(self, pose: RoverPose | None) -> Self:
+        """Return it with a position of the site in the rover frame of a pose."""
+        if self.frame != "site" or pose is None:
+            return self
+        place = pose.site_from_rover.inverse.points(np.array(self.position_m)).tolist()
+        return self.model_copy(update={"position_m": place, "frame": "rover"})
+
+
+class PointRequest(TrackRequest):
+    """``POST /point``: exactly one of pixel, position_m, or pan_rad with tilt_rad.
 
     Attributes
     ----------
-    target
-        A pixel of a named frame, a position, or joint angles.
     aim
         Where the target is wanted; by default the image centre of the clicked camera if it is on the head,
         else of the first stereo pair's left camera on the head.
     pointings
-        How often to point, 1 or 2: a second one uses what the new pictures showed.
+        How often to point: a second one uses what the new images showed.
     range_m
-        How far what a pixel shows is from its camera; then no other eye is asked. None: it is measured by
+        How far what a pixel shows is from its camera; then no other camera is needed. None: it is measured by
         the pair, or not known where the camera is in none.
     plane
         Or the plane in which it lies.
-
-    Raises
-    ------
-    ValueError
-        If it is none (pydantic's, with place and value), or parts of it do not go together.
     """
 
-    target: Target
+    pan_rad: Angle | None = None
+    tilt_rad: Angle | None = None
     aim: Aim | None = None
     pointings: Pointings = 1
     range_m: Range | None = None
     plane: PlaneTarget | None = None
 
-    def __post_init__(self) -> None:
-        if self.aim is not None and isinstance(self.target, AnglesTarget):
+    def _check_targets(self) -> None:
+        """Pass exactly one target, and what goes with it. Raises ValueError."""
+        angles = (self.pan_rad is not None) + (self.tilt_rad is not None)
+        targets = (self.pixel is not None) + (self.position_m is not None) + (angles > 0)
+        if targets != 1:
+            raise ValueError(
+                f"{targets} targets where exactly one of pixel, position_m, pan_rad with tilt_rad is expected"
+            )
+        if angles == 1:
+            missing = "tilt_rad" if self.tilt_rad is None else "pan_rad"
+            raise ValueError(f"{missing} is missing; pan_rad and tilt_rad go together")
+        if self.aim is not None and angles:
             raise ValueError("aim goes with pixel or position_m, not with joint angles")
         for name, given in (("range_m", self.range_m), ("plane", self.plane)):
-            if given is not None and not isinstance(self.target, PixelTarget):
+            if given is not None and self.pixel is None:
                 raise ValueError(f"{name} goes with pixel only")
         if self.range_m is not None and self.plane is not None:
             raise ValueError("range_m and plane both say how far it is; one of them is expected")
-        if self.pointings == 2 and not isinstance(self.target, PixelTarget):
+        if self.pointings == 2 and self.pixel is None:
             raise ValueError("pointings is 2, which goes with pixel only: nothing else can be measured again")
+
+    @property
+    def angles_rad(self) -> tuple[float, float] | None:
+        """The joint angles, if these are the target."""
+        return None if self.pan_rad is None or self.tilt_rad is None else (self.pan_rad, self.tilt_rad)
+
+    @property
+    def looks(self) -> int:
+        """How often it goes somewhere and takes images there."""
+        return 0 if self.angles_rad is not None else self.pointings
 
 
 def aim_of(request: PointRequest, rig: Rig) -> Aim:
     """Return the request's aim, or the default where it names none.
 
-    Raises
-    ------
-    BadRequest
-        ``bad_aim`` (no camera that is configured and turns with the head), ``outside_image``.
+    Raises BadRequest ``bad_aim`` (no camera that is configured and turns with the head), ``outside_image``.
     """
     aim = request.aim
     on_head = [name for name, camera in rig.cameras.items() if camera.on == "head"]
     if aim is None:
-        clicked = [request.target.camera] if isinstance(request.target, PixelTarget) else []
+        clicked = [] if request.pixel is None else [request.pixel.camera]
         lefts = [left for left, _ in rig.stereo.values()]
         for name in [*clicked, *lefts, *on_head]:
             if name in on_head:
                 return Aim(name, *rig.cameras[name].model.image_center_px)
-        words = "no camera on the head is configured to aim with; only joint angles can be pointed at"
-        raise BadRequest("bad_aim", words)
+        message = "no camera on the head is configured to aim with; only joint angles can be pointed at"
+        raise BadRequest("bad_aim", message)
     if aim.camera not in on_head:
         known = ", ".join(on_head) or "there is none"
-        words = f"'{aim.camera[:80]}' where a configured camera on the head is expected: {known}"
-        raise BadRequest("bad_aim", f"aim.camera is {words}")
+        message = f"'{aim.camera[:80]}' where a configured camera on the head is expected: {known}"
+        raise BadRequest("bad_aim", f"aim.camera is {message}")
     _check_inside(rig, aim.camera, aim.x_px, aim.y_px, "aim")
     return aim
 
@@ -153,20 +186,10 @@ def aim_of(request: PointRequest, rig: Rig) -> Aim:
 def clicked_frame(target: PixelTarget, rig: Rig, find: Callable[[str], StampedFrame]) -> StampedFrame:
     """Return the frame that was clicked in, if its camera, the pixel and its moment serve.
 
-    Parameters
-    ----------
-    target
-        What was clicked.
-    rig
-        The cameras that are configured.
-    find
-        Returns a kept frame by its id.
+    ``find`` returns a kept frame by its id. ``rig`` has the cameras that are configured.
 
-    Raises
-    ------
-    NotKnown, BadRequest, NotNow
-        ``unknown_camera``, ``wrong_camera``, ``outside_image``, ``frame_moving``; whatever
-        ``find`` raises.
+    Raises NotKnown, BadRequest, NotNow ``unknown_camera``, ``wrong_camera``, ``outside_image``,
+    ``frame_moving``; whatever ``find`` raises.
     """
     camera = target.camera
     check_known(camera, rig.cameras)
@@ -174,30 +197,30 @@ def clicked_frame(target: PixelTarget, rig: Rig, find: Callable[[str], StampedFr
     if frame.camera != camera:
         raise wrong_camera(frame, camera)
     if frame.moving:
-        words = f"the head moved while this image of {camera} was exposed; take another"
-        raise NotNow("frame_moving", words)
+        message = f"the head moved while this image of {camera} was exposed; take another"
+        raise NotNow("frame_moving", message)
     _check_inside(rig, camera, target.x_px, target.y_px, "pixel")
     return frame
 
 
 def wrong_camera(frame: StampedFrame, camera: str) -> BadRequest:
-    """Return what is wrong with a frame that is of another camera than was said."""
+    """Return the refusal of a frame that is of another camera than was said."""
     return BadRequest("wrong_camera", f"frame {frame.frame_id} is of camera {frame.camera}, not of {camera}")
 
 
 def check_pair(camera: str, rig: Rig, mast_file: Rig) -> None:
-    """Pass a camera whose other eye is configured too, as a track needs. Raises BadRequest ``no_stereo``.
+    """Pass a camera whose stereo partner is configured too, as a track needs.
 
-    ``rig`` has the cameras that are configured, ``mast_file`` all.
+    ``rig`` has the cameras that are configured, ``mast_file`` all. Raises BadRequest ``no_stereo``.
     """
-    if any(camera in eyes for eyes in rig.stereo.values()):
+    if any(camera in cameras for cameras in rig.stereo.values()):
         return
-    words = f"{camera} is in no stereo pair of the mast file"
-    for pair, eyes in mast_file.stereo.items():
-        if camera in eyes:
-            other = eyes[1] if camera == eyes[0] else eyes[0]
-            words = f"the other camera of the stereo pair {pair}, {other}, is not in the configuration"
-    raise BadRequest("no_stereo", f"{words}, so what its pixels show cannot be followed")
+    reason = f"{camera} is in no stereo pair of the mast file"
+    for pair, cameras in mast_file.stereo.items():
+        if camera in cameras:
+            other = cameras[1] if camera == cameras[0] else cameras[0]
+            reason = f"the other camera of the stereo pair {pair}, {other}, is not in the configuration"
+    raise BadRequest("no_stereo", f"{reason}, so what its pixels show cannot be followed")
 
 
 def _check_inside(rig: Rig, camera: str, x_px: float, y_px: float, what: str) -> None:
@@ -205,5 +228,5 @@ def _check_inside(rig: Rig, camera: str, x_px: float, y_px: float, what: str) ->
     model = rig.cameras[camera].model
     if not model.holds((x_px, y_px)):
         width, height = model.size_px
-        words = f"{what} ({x_px:g}, {y_px:g}) is outside the image of {width}x{height} px of {camera}"
-        raise BadRequest("outside_image", words)
+        place = f"{what} ({x_px:g}, {y_px:g}) is outside the image of {width}x{height} px of {camera}"
+        raise BadRequest("outside_image", place)

@@ -1,10 +1,9 @@
-"""What the pointing loop answers: steps, pointings with their residuals, and how a request fails."""
+"""What the pointing loop returns: steps, pointings with their residuals, and how a request fails."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -12,11 +11,9 @@ import numpy as np
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
-from drivers.clock import Clock
 from drivers.errors import DriverError
 from drivers.interfaces import AxisReport
 from mastctl.errors import MastctlError
-from mastctl.motion.requests import Aim
 
 Pair = tuple[float, float]
 
@@ -42,18 +39,18 @@ class Pointing:
     Attributes
     ----------
     commanded_pan_rad, commanded_tilt_rad, measured_pan_rad, measured_tilt_rad
-        Joint angles that were sent, and those measured at the new picture's mid-exposure: as the head reads
+        Joint angles that were sent, and those measured at the new image's mid-exposure: as the head reads
         them.
     true_pan_rad, true_tilt_rad
-        Where it truly stood then, by the mast file's joints.
+        The true angles then, by the mast file's joints.
     camera, frame_id
-        The new picture: exposed after the head had settled.
+        The new image: exposed after the head had settled.
     aim_px
         (x, y) where the target was wanted; None for joint angles.
     predicted_px
         (x, y) where target position, mast file and measured joint angles put it; None if out of view.
     target_px
-        (x, y) where the picture shows it; None where nothing was clicked that could be looked for.
+        (x, y) where the image shows it; None where nothing was clicked that could be found again.
     residual_px, residual_sigma_px
         target_px - aim_px, and one sigma of the match; None as above.
     predicted_sigma_px, predicted_covariance_px2
@@ -62,8 +59,8 @@ class Pointing:
     note
         One sentence that says why there is no residual; empty otherwise.
     motion_evidence
-        By camera of the new pictures: whether they moved as the joints did, as a ``verdict`` with numbers; of
-        the one that measured also how a later picture repeated it (`mastctl.motion.evidence`).
+        By camera of the new images: whether they moved as the joints did, as a ``verdict`` with numbers; of
+        the one that measured also how a later image repeated it (`mastctl.motion.evidence`).
     """
 
     commanded_pan_rad: float
@@ -72,68 +69,17 @@ class Pointing:
     measured_tilt_rad: float
     true_pan_rad: float
     true_tilt_rad: float
-    camera: str
-    frame_id: str
-    aim_px: Pair | None
-    predicted_px: Pair | None
-    target_px: Pair | None
-    residual_px: Pair | None
-    residual_sigma_px: Pair | None
+    camera: str = ""
+    frame_id: str = ""
+    aim_px: Pair | None = None
+    predicted_px: Pair | None = None
+    target_px: Pair | None = None
+    residual_px: Pair | None = None
+    residual_sigma_px: Pair | None = None
     predicted_sigma_px: Pair | None = None
     predicted_covariance_px2: tuple[Pair, Pair] | None = None
     note: str = ""
     motion_evidence: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Preview:
-    """What a clicked pixel shows, before anything moves.
-
-    Attributes
-    ----------
-    camera, frame_id, pixel_px
-        A fresh frame of the clicked camera, and where (x, y) it shows what was clicked.
-    other_camera, other_frame_id, other_pixel_px, other_sigma_px
-        The same in the other eye of its pair, with one sigma of the match. None, as the next three, where one
-        camera points alone.
-    correlation, second
-        Of the best match in the other eye, and of the next best.
-    across_px
-        How far the match lies off the epipolar line.
-    position_m, sigma_m
-        The point in the rover frame, and one sigma along each axis (the clicks', not the mast file's; None
-        with one camera).
-    range_m, range_sigma_m
-        Its distance from the clicked camera, and one sigma along it (None with one camera).
-    range_from, range_interval_m
-        As in `PointingResult`.
-    aim
-        Where it would come.
-    goal_rad
-        Pan and tilt that the head would be sent to; None where nothing leads there.
-    refused
-        ``code`` and ``message`` where the head would not be sent.
-    """
-
-    camera: str
-    frame_id: str
-    pixel_px: Pair
-    position_m: tuple[float, float, float]
-    range_m: float
-    range_from: str
-    aim: Aim
-    goal_rad: Pair | None
-    refused: Mapping[str, str] | None
-    range_interval_m: tuple[float, float | None] | None = None
-    other_camera: str | None = None
-    other_frame_id: str | None = None
-    other_pixel_px: Pair | None = None
-    other_sigma_px: Pair | None = None
-    correlation: float | None = None
-    second: float | None = None
-    across_px: float | None = None
-    sigma_m: tuple[float, float, float] | None = None
-    range_sigma_m: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,14 +88,9 @@ class PointingResult:
 
     ``position_m`` and ``range_m`` are those of the last pointing, None for joint angles.
 
-    Attributes
-    ----------
-    range_from
-        What says how far the target is: ``stereo``; ``given``, ``plane``, ``parallax`` or ``unknown`` with
-        one camera; empty where nothing was clicked.
-    range_interval_m
-        With one camera, the ranges that are 95 % likely after the last picture; the farther is None for
-        infinity.
+    ``range_from``: what says how far the target is: ``stereo``; ``given``, ``plane``, ``parallax`` or
+    ``unknown`` with one camera; empty where nothing was clicked; ``range_interval_m``: with one camera, the
+    ranges that are 95 % likely after the last image; the farther is None for infinity.
     """
 
     position_m: tuple[float, float, float] | None
@@ -213,70 +154,34 @@ def rounded(values: FloatArray | Pair, digits: int = 4) -> list[float]:
     return [round(float(value), digits) for value in np.asarray(values).ravel()]
 
 
-class StepRecorder:
-    """Hands every step to ``tell`` when it ends, and remembers which one it was."""
+def counts_left(devices: object, tilt_rad: float, model: CameraModel | None) -> dict[str, Any]:
+    """Return ``counts``: goal, measured count and what is left between command and measurement, by axis.
 
-    def __init__(self, tell: Callable[[Step], None], clock: Clock, before: Callable[[], None]) -> None:
-        self._tell = tell
-        self._clock = clock
-        self._before = before
-        self.last = "request"
+    A head that fails to answer has ``counts_missing`` instead, which says why; one without ``report`` (see
+    `drivers.interfaces.PanTilt`) nothing.
 
-    @contextmanager
-    def step(self, name: str, **known: Any) -> Iterator[dict[str, Any]]:
-        """Record what happens inside as one step; ``before`` runs first and may refuse it.
-
-        The dict that is handed out, begun with what is known, becomes the step's detail. A failed step gets
-        the error's code and message too, and the error goes on.
-        """
-        self.last = name
-        started_s = self._clock.now_s()
-        detail: dict[str, Any] = dict(known)
-        try:
-            self._before()
-            yield detail
-        except BaseException as error:
-            detail.update(code=getattr(error, "code", "internal"), message=" ".join(str(error).split()))
-            self._tell(Step(name, "failed", started_s, self._clock.now_s() - started_s, detail))
-            raise
-        self._tell(Step(name, "done", started_s, self._clock.now_s() - started_s, detail))
-
-
-def counts_told(head: object, tilt_rad: float, model: CameraModel | None) -> dict[str, Any]:
-    """Return goal, measured count and what is left between command and measurement, for each axis.
-
-    A head that fails to tell has ``counts_missing`` instead, which says why: nothing fails by it.
-
-    Parameters
-    ----------
-    head
-        Anything; what has no ``report`` (see `drivers.interfaces.PanTilt`) knows no counts: empty.
-    tilt_rad
-        Where the head looks: a pan turns the picture of a head that looks up less.
-    model
-        The aiming camera, for the pixels; None for joint angles alone.
+    ``tilt_rad``: where the head is: a pan turns the image of a head that looks up less; ``model``: the aiming
+    camera, for the pixels; None for joint angles alone.
     """
-    report = getattr(head, "report", None)
+    report = getattr(devices, "report", None)
     try:
         axes: dict[str, AxisReport] = dict(report()) if report is not None else {}
     except DriverError as error:
         return {"counts_missing": str(error)}
-    told: dict[str, Any] = {}
+    counts: dict[str, dict[str, Any]] = {}
     for name, axis in axes.items():
-        told[name] = {
-            "goal_counts": axis.goal_counts,
-            "measured_counts": axis.measured_counts,
-            "came_from": axis.side,
-        }
+        one: dict[str, Any] = {"goal_counts": axis.goal_counts, "measured_counts": axis.measured_counts}
+        counts[name] = one
+        one["came_from"] = axis.side
         if axis.count_rad is not None:
-            told[name]["count_rad"] = axis.count_rad
+            one["count_rad"] = axis.count_rad
         if axis.left_rad is None:
             continue
-        told[name]["left_rad"] = round(axis.left_rad, 7)
+        one["left_rad"] = round(axis.left_rad, 7)
         if model is not None:
             # Yakimovsky and Cunningham (1978): the focal lengths of columns and rows
             focal_px = model.focal_px[0 if name == "pan" else 1]
             share = math.cos(tilt_rad) if name == "pan" else 1.0
             left_px = axis.left_px(focal_px)
-            told[name]["left_px"] = None if left_px is None else round(share * left_px, 3)
-    return {"counts": told} if told else {}
+            one["left_px"] = None if left_px is None else round(share * left_px, 3)
+    return {"counts": counts} if counts else {}

@@ -31,7 +31,7 @@ class PointingSettings:
         How far the readings of a head at rest may lie from each other: three counts of a 12-bit servo.
     arrival_tolerance_rad
         How far from the commanded angle a head may rest: three counts and half the backlash of a 12-bit
-        servo, 6 mrad. What remains is measured in the picture.
+        servo, 6 mrad. What remains is measured in the image.
     acceleration_s, margin_s
         Beyond distance over speed: ramps and an approach from one side; then everything else.
     reading_age_s
@@ -41,39 +41,39 @@ class PointingSettings:
     rest_wait_s
         How long a request waits for a head that still moves.
     frame_timeout_s
-        For a new picture: some frames of a slow camera, on a busy machine.
+        For a new image: some frames of a slow camera, on a busy machine.
     repeat_after_s
-        How much later a second picture is taken, which has to repeat a residual before it is told; 0: none.
-        Pictures older than their stamps by up to that are found out: what is told was measured in one that
-        was exposed by a head at rest.
+        How much later a second image is taken, which has to repeat a residual before it is reported; 0: none.
+        So an image older than its stamp by up to that is found out: the residual was measured in one that was
+        exposed by a head at rest.
     same_pose_rad
         Joint angles nearer than this are one pose: a tenth of a Pancam pixel.
     same_moment_s
-        Exposures less apart than this are one: half a pixel would take 5000 px/s, which blurs any picture.
-    between_eyes_px
+        Exposures less apart than this are one: half a pixel would take 5000 px/s, which blurs any image.
+    between_cameras_px
         How far the target may move between the exposures of a pair that serves a measurement.
     nearest_m
-        Nothing nearer is looked for.
+        Nothing nearer is searched.
     unknown_nearest_m
-        A thing whose range nobody tells is taken to be here or farther, in 95 of 100: nearer than a mast's
-        camera has the ground only looking straight down.
+        A thing of unknown range is assumed at this or farther, in 95 of 100: nearer than a mast's camera has
+        the ground only looking straight down.
     search_px, wide_search_px
         Half windows around the predicted place: what arrival tolerance and mast file explain in a Navcam
         (6 mrad are 8 px) with room; then what a slipped encoder may do (2 degrees are 45 px in a Navcam, 120
         in a Pancam).
-    eyes_px, range_px
+    across_px, range_px
         Largest offset across the epipolar line, and along it after the move (same pair only), that is still
         put down to calibration: the paper's mast fit leaves 1.1 px rms.
     triangulation_sigma_px
-        Of a pixel for the position's covariance: noise and calibration. What the match in the other eye
-        tells is added, so that a position on rough ground is told as less sure.
+        Of a pixel for the position's covariance: noise and calibration. What the match in the other
+        camera shows is added, so that a position on rough ground is reported as less sure.
     view
-        What may lie between the view that joints tell and the one that a picture shows.
+        What may lie between the view that joints state and the one that an image shows.
     match, small_half_px
         Of the matching itself; and the half patch that is tried after a move where the usual one fits
-        nowhere. ``roughness`` and ``relief`` decide sigmas only, and only where no second eye saw the
+        nowhere. ``roughness`` and ``relief`` decide sigmas only, and only where no second camera saw the
         surface (``rough_beside_relief`` is False). A second place may fit a little better than elsewhere, as
-        along a rock's smooth edge: the prediction and the other eye must confirm the best.
+        along a rock's smooth edge: the prediction and the other camera must confirm the best.
     """
 
     poll_s: float = 0.02
@@ -89,12 +89,12 @@ class PointingSettings:
     repeat_after_s: float = 1.0
     same_pose_rad: float = 3e-5
     same_moment_s: float = 1e-4
-    between_eyes_px: float = 0.5
+    between_cameras_px: float = 0.5
     nearest_m: float = 0.4
     unknown_nearest_m: float = 1.0
     search_px: float = 48.0
     wide_search_px: float = 200.0
-    eyes_px: float = 2.0
+    across_px: float = 2.0
     range_px: float = 4.0
     triangulation_sigma_px: float = 0.2
     small_half_px: int = 12
@@ -107,7 +107,7 @@ class PointingSettings:
 
 
 class PairBounds(Record):
-    """Where a pair looks; its range is that from the middle between its cameras."""
+    """For which targets a pair serves; its range is that from the middle between its cameras."""
 
     nearest_m: Annotated[float, Field(ge=0.0, le=1000.0)] = Field(
         default=0.0, description="least range of the target"
@@ -136,7 +136,7 @@ class HandoffRules(Record):
     )
 
     def bounds(self, pair: str) -> PairBounds:
-        """Return where a pair looks."""
+        """Return for which targets a pair serves."""
         return self.pairs.get(pair) or USUAL_BOUNDS.get(pair, PairBounds())
 
 

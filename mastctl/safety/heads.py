@@ -33,9 +33,9 @@ _PTS = re.compile(r"pts-\d+-")
 
 def head_folders(name: str) -> list[Path]:
     """Return the folders in which a head's latch may lie, the one that is preferred first."""
-    told = os.environ.get(VARIABLE, "")
-    if told and _SIMULATED.match(name):
-        return [Path(told) / _folder_name(name)]
+    given = os.environ.get(VARIABLE, "")
+    if given and _SIMULATED.match(name):
+        return [Path(given) / _folder_name(name)]
     found = [SYSTEM / "heads"] if _is_there(SYSTEM) else []
     with contextlib.suppress(KeyError):  # a user whom the password database does not know
         found.append(_home() / ".local" / "state" / "mastctl" / "heads")
@@ -45,10 +45,7 @@ def head_folders(name: str) -> list[Path]:
 def take(name: str) -> StateFolder | None:
     """Take a head's place for this program alone; None where none can be made.
 
-    Raises
-    ------
-    StateInUse
-        If another program drives this head.
+    Raises StateInUse if another program drives this head.
     """
     refused = ""
     for folder in head_folders(name):
@@ -71,7 +68,7 @@ def of_settings(settings: HardwareSettings) -> StateFolder | None:
 
 
 def others(name: str | None, place: StateFolder | None) -> Sequence[Path]:
-    """Return the head's folders beside the one that was taken: what is latched there holds too."""
+    """Return the head's folders beside the one that was taken: what is latched there counts too."""
     if name is None:
         return ()
     return [folder for folder in head_folders(name) if place is None or folder != place.path]

@@ -39,8 +39,7 @@ HEAD_FIRST_S = 0.1  # how long the disk waits for the head's stop, at most
 AGAIN_S = 2.0
 PATIENCE_S = 2.0  # of a reset for a disk that is busy
 ROOM_BYTES = 32768  # for the longest reasons and names of all entries, however they are written
-LONGEST = 200
-"""Characters of a reason or a name that are kept."""
+LONGEST = 200  # characters of a reason or a name that are kept
 
 
 class Estopped(Stopped):
@@ -53,23 +52,12 @@ class Estopped(Stopped):
 class Latch:
     """The emergency stop of one head; safe to use from any thread.
 
-    Parameters
-    ----------
-    folder
-        Where they are kept.
-    state
-        The daemon's state folder, if that is another one; it remembers where the latch is.
-    others
-        Folders beside them: what is latched there holds too, and is released there too.
+    ``folder``: where the causes are kept; ``state``: the daemon's state folder, if that is another one; it
+    remembers where the latch is; ``others``: folders beside them: what is latched there counts too, and is
+    released there too.
 
-    Attributes
-    ----------
-    entries
-        The causes, the oldest first, empty if nothing is latched; read without a lock.
-    folder
-        Where they are kept.
-    since_s
-        When the first one was latched in this process, seconds of CLOCK_MONOTONIC.
+    ``entries``: the causes, the oldest first, empty if nothing is latched; read without a lock; ``since_s``:
+    when the first one was latched in this process, seconds of CLOCK_MONOTONIC.
     """
 
     def __init__(
@@ -87,7 +75,7 @@ class Latch:
         self.entries: tuple[Latched, ...] = ()
         self._kept: tuple[Latched, ...] | None = ()  # what a restart would find latched
         self._problem = ""
-        self._asked = 0
+        self._count = 0  # of requests
         self.since_s = time.monotonic()
         self._due_s = 0.0  # when the disk may be written to
         self._ended = False
@@ -105,19 +93,13 @@ class Latch:
             log.warning("%s", latched_sentence(self.entries))
         threading.Thread(target=self._keep, name="latch", daemon=True).start()
 
-    @property
-    def held(self) -> Latched | None:
-        """The oldest cause, None if nothing is latched; read without a lock."""
-        entries = self.entries
-        return entries[0] if entries else None
-
     def hold(self, reason: str | None, name: str | None) -> Latched:
         """Latch in memory, at once; return the cause. The log keeps each once, and the first `MOST`.
 
-        The disk is written to when `head_told` is called, or a moment later.
+        The disk is written to when `head_stopped` is called, or a moment later.
         """
         with self._changed:
-            self._asked += 1
+            self._count += 1
             cause = Latched(_line(name, NO_NAME), _line(reason, NO_REASON), _now())
             before = self.entries
             self.entries = _merged(before, (cause,))
@@ -137,13 +119,13 @@ class Latch:
             bare = next((one for one in self.entries if (one.name, one.reason) == (NO_NAME, NO_REASON)), None)
             if bare is None:
                 return None
-            self._asked += 1  # a reset that is under way has not released this
+            self._count += 1  # a reset that is under way has not released this
             cause = replace(bare, name=_line(name, NO_NAME), reason=_line(reason, NO_REASON))
             self.entries = _merged((), tuple(cause if one is bare else one for one in self.entries))
             self._changed.notify_all()
             return cause
 
-    def head_told(self) -> None:
+    def head_stopped(self) -> None:
         """Let the disk be written to: the head comes first."""
         with self._changed:
             self._due_s = 0.0
@@ -167,7 +149,7 @@ class Latch:
 
     @property
     def not_kept(self) -> str:
-        """Why an emergency stop is not kept, in plain words; empty if it is, or none is latched."""
+        """Why an emergency stop is not kept, one sentence; empty if it is, or none is latched."""
         if not self.entries or self.survives:
             return ""
         if self._folder.is_temporary:
@@ -177,24 +159,15 @@ class Latch:
     def release(self, reason: str, name: str) -> tuple[Latched, ...]:
         """Release the latch on the disk, then in memory; return its causes.
 
-        Parameters
-        ----------
-        reason, name
-            Of the reset.
-
-        Raises
-        ------
-        NotNow
-            ``not_estopped`` if none is latched, ``stopping`` if another stop came meanwhile.
-        Unable
-            ``not_saved`` if the disk still has the stop: a restart would be latched again.
+        Raises NotNow ``not_estopped`` if none is latched, ``stopping`` if another stop came meanwhile; Unable
+        ``not_saved`` if the disk still has the stop: a restart would be latched again.
         """
         name, reason = _line(name, ""), _line(reason, "")
         if not self._disk.acquire(timeout=PATIENCE_S):
             message = "the disk has not taken the emergency stop yet; a reset follows it"
             raise Unable("not_saved", message, PATIENCE_S)
         try:
-            causes, asked = self.entries, self._asked
+            causes, count = self.entries, self._count
             if not causes:
                 raise NotNow("not_estopped", "no emergency stop is latched")
             with self._changed:  # before the disk changes: from here on no answer states that it has the stop
@@ -204,7 +177,7 @@ class Latch:
                 self._write_released({"latched": False, **asdict(causes[0]), "released": released})
             with self._changed:
                 self._changed.notify_all()
-                if asked != self._asked:
+                if count != self._count:
                     raise NotNow("stopping", "another emergency stop came during the reset; it is latched")
                 self.entries = self._kept = ()
                 self._problem = ""
@@ -225,7 +198,7 @@ class Latch:
         """Write to the disk that nothing is latched. Raises Unable."""
 
         def remove() -> None:
-            for file in (*self._marks, self._file):  # without its mark nobody misses the file
+            for file in (*self._marks, self._file):  # without its mark the file is not missed
                 file.remove()
 
         ways: tuple[Callable[[], None], ...] = (
@@ -268,16 +241,16 @@ class Latch:
                     left_s = self._due_s - time.monotonic()
                     self._changed.wait(None if self.entries is self._kept else max(0.0, left_s))
             with self._disk:
-                held = self.entries
-                if not held:
+                entries = self.entries
+                if not entries:
                     continue
                 try:
-                    self._write_held(held)
+                    self._write(entries)
                     self._mark()
                     problem = ""
                 except BadFile as error:
                     problem = str(error)
-                self._tried(held, problem)
+                self._tried(entries, problem)
 
     def _mark(self) -> None:
         """Remember that the file is there, once it is."""
@@ -288,35 +261,31 @@ class Latch:
                 if not _names(mark, self._file):
                     mark.write({"latch": str(self._file.path)})
 
-    def _write_held(self, held: tuple[Latched, ...]) -> None:
-        """Have them on the disk. Raises BadFile."""
-        document = _document(held)
+    def _write(self, entries: tuple[Latched, ...]) -> None:
+        """Have causes on the disk. Raises BadFile."""
+        document = _document(entries)
         try:
             try:
                 self._file.overwrite(document)
             except BadFile:  # no file with room for it, or one that cannot be written to any more
                 self._file.write(document)
         except BadFile:
-            self._on_disk = self._on_disk or self._says_latched()
+            self._on_disk = self._on_disk or bool(_entries(self._file))
             raise
         self._on_disk = True
 
-    def _says_latched(self) -> bool:
-        """Whether a restart would read the file as latched."""
-        return bool(_entries(self._file))
-
-    def _tried(self, held: tuple[Latched, ...], problem: str) -> None:
+    def _tried(self, entries: tuple[Latched, ...], problem: str) -> None:
         """Note how the writing went, and log each change once."""
         if problem and problem != self._problem:
             log.error("the emergency stop would not survive a restart: %s", problem)
         with self._changed:
             if not problem:
-                self._kept = held
+                self._kept = entries
             self._problem = problem
             self._due_s = time.monotonic() + AGAIN_S if problem else 0.0
             self._changed.notify_all()
             if problem and self._ended:
-                self._kept = held  # nothing more can be done
+                self._kept = entries  # nothing more can be done
 
 
 def latched_at(folders: Sequence[Path], others: Sequence[Path]) -> tuple[Latched, ...]:
@@ -342,14 +311,14 @@ def _file_in(folder: Path) -> StateFile:
 def _names(mark: StateFile, file: StateFile) -> bool:
     """Whether a mark names a latch file; one that cannot be read is treated so too."""
     try:
-        told = mark.read()
+        content = mark.read()
     except BadFile:
         return True
-    return told is not None and told.get("latch") == str(file.path)
+    return content is not None and content.get("latch") == str(file.path)
 
 
 def _gone(file: StateFile, marks: Sequence[StateFile]) -> tuple[Latched, ...]:
-    """What holds where there is no latch file: nothing, unless there was one."""
+    """What is latched where there is no latch file: nothing, unless there was one."""
     if not any(_names(mark, file) for mark in marks):
         return ()
     reason = f"whether one was latched is not known, since {file.path} is gone"
@@ -404,4 +373,4 @@ def _line(text: str | None, otherwise: str) -> str:
 
 
 def _text(value: object) -> str:
-    return one_line(value, LONGEST) if isinstance(value, str) else "not told"
+    return one_line(value, LONGEST) if isinstance(value, str) else "not stated"

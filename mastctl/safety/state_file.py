@@ -1,7 +1,7 @@
 """Files in which a daemon keeps what must outlive it: one JSON document each, versioned, replaced whole.
 
-`StateFile.overwrite` is for the one document that has no time for that, and that is taken for written where
-the file cannot be read.
+`StateFile.overwrite` is for the one document that has no time for that, and that counts as written where the
+file cannot be read.
 """
 
 from __future__ import annotations
@@ -23,16 +23,9 @@ MAX_BYTES = 1 << 20
 class StateFile:
     """One document, of which a crash during `write` leaves the old or the new, whole.
 
-    Attributes
-    ----------
-    path
-        The file; its folder must be there.
-    schema
-        Its kind and version, such as ``mastctl/latch/1``: a file that says another one is refused.
-    room
-        How long the file is at least, bytes, filled up with blanks: what `overwrite` may need.
-    mode
-        Who may read and write it.
+    ``path`` is in a folder that is there; ``schema`` its kind and version, such as ``mastctl/latch/1``: a
+    file with another one is refused. ``room`` is how long the file is at least, bytes, filled up with blanks:
+    what `overwrite` may need.
     """
 
     path: Path
@@ -43,10 +36,7 @@ class StateFile:
     def read(self) -> dict[str, Any] | None:
         """Return the document without its schema; None if there is no file.
 
-        Raises
-        ------
-        BadFile
-            If there is one that cannot be read, or is something else.
+        Raises BadFile if there is one that cannot be read, or is something else.
         """
         try:
             with open_plain(self.path) as file:
@@ -73,13 +63,8 @@ class StateFile:
     def write(self, document: Mapping[str, Any]) -> None:
         """Put a document in the place of the former one; when this returns it is on the disk.
 
-        Raises
-        ------
-        BadFile
-            If the file system refuses; what is then read is the former document, or the new one if only its
-            way to the disk was not confirmed.
-        ValueError, TypeError
-            If it is no JSON.
+        Raises BadFile if the file system refuses; what is then read is the former document, or the new one if
+        only its way to the disk was not confirmed.
         """
         data = self._data(document)
         try:
@@ -90,7 +75,7 @@ class StateFile:
     def overwrite(self, document: Mapping[str, Any]) -> None:
         """Write a document over the former one, as quickly as can be; when this returns it is on the disk.
 
-        A crash meanwhile may leave a file that cannot be read: only for what is then taken as this document.
+        A crash meanwhile may leave a file that cannot be read: only for what then counts as this document.
         Raises as `write`, and BadFile if there is no file with room for it.
         """
         data = self._data(document)

@@ -40,8 +40,6 @@ class StateFolder:
 
     Attributes
     ----------
-    path
-        Where it is.
     is_temporary
         Whether it goes when it is closed.
     why_temporary
@@ -65,13 +63,13 @@ class StateFolder:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             os.close(self._lock)
-            words = (
+            message = (
                 f"the head at {of_head} is driven by another program (its place {path} is in use); end that"
                 if of_head
                 else f"the state folder {path} is in use by another daemon; end it, or give this one another "
                 "folder (key state.folder)"
             )
-            raise StateInUse(words) from None
+            raise StateInUse(message) from None
 
     @classmethod
     def temporary(cls, why: str = "") -> StateFolder:
@@ -83,25 +81,12 @@ class StateFolder:
         """Take the folder of a configuration, and make it if it is not there.
 
         A usual place that cannot be made is replaced by a temporary one, since nothing can be kept there; one
-        that was named is insisted upon, since something may.
-
-        Parameters
-        ----------
-        named
-            The configuration's ``state.folder``, if it has one.
-        config, address
-            The configuration's file, and where the daemon listens; they make the name of the usual place.
-
-        Raises
-        ------
-        BadFile
-            If the folder cannot be opened, or made where it is named.
-        StateInUse
-            If another daemon uses it.
+        that was ``named`` (``state.folder``) is insisted upon, since something may. The configuration's file
+        and the daemon's address make the name of the usual place. Raises BadFile, StateInUse.
         """
-        told = cls.named(named)
-        if told is not None:
-            return told
+        found = cls.named(named)
+        if found is not None:
+            return found
         try:
             path = usual_folder(config, address)
             _made(path)
@@ -120,14 +105,14 @@ class StateFolder:
 
     def note_daemon(self, config: Path, url: str, stop_socket: Path | None) -> None:
         """Write which daemon uses this folder, for commands that find it; `refused` has a disk's refusal."""
-        told = {
+        content = {
             "pid": os.getpid(),
             "url": url,
             "config": str(config.resolve()),
             "stop_socket": str(stop_socket),
         }
         try:
-            StateFile(self.path / DAEMON_FILE, DAEMON_SCHEMA).write(told)
+            StateFile(self.path / DAEMON_FILE, DAEMON_SCHEMA).write(content)
         except BadFile as error:
             self.refused = str(error)
             log.error("the state folder cannot be written: %s", error)
@@ -140,7 +125,7 @@ class StateFolder:
         if self.is_temporary:
             gone = self.path.with_name(f"{self.path.name}-gone")
             with contextlib.suppress(OSError):
-                self.path.rename(gone)  # who still writes finds no folder: a file more would keep it
+                self.path.rename(gone)  # what still writes finds no folder: a file more would keep it
             shutil.rmtree(gone, ignore_errors=True)
         with contextlib.suppress(OSError):
             os.close(lock)
@@ -148,8 +133,8 @@ class StateFolder:
 
 def state_home() -> Path:
     """Return the folder that holds the usual places of all daemons of this user."""
-    told = os.environ.get("XDG_STATE_HOME", "")
-    return (Path(told) if Path(told).is_absolute() else Path.home() / ".local" / "state") / NAME
+    home = Path(os.environ.get("XDG_STATE_HOME", ""))
+    return (home if home.is_absolute() else Path.home() / ".local" / "state") / NAME
 
 
 def usual_folder(config: Path, address: str) -> Path:
@@ -168,7 +153,7 @@ def folder_of(named: Path | None, config: Path, address: str) -> Path | None:
 def folders_of(config: Path | None) -> list[Path]:
     """Return the places in which a daemon's state may be, of one configuration or of any, as far as known.
 
-    Only what is there; for who cannot read the configuration.
+    Only what is there; for a program that cannot read the configuration.
     """
     found = [path for path in [_of_systemd()] if path is not None and path.is_dir()]
     stem = "*" if config is None else escape(config.stem)

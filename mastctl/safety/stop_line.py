@@ -25,49 +25,39 @@ class NoAnswer(Exception):
 def sockets_of(folder: Path | None, config: Path | None, url: str | None) -> list[Path]:
     """Return the stop sockets of a daemon, whether a program listens there or not.
 
-    Parameters
-    ----------
-    folder
-        Its state folder, if that is known.
-    config
-        Its configuration, which may be broken; None for any.
-    url
-        Its address, if that is known.
+    ``folder`` is its state folder, ``config`` its configuration, which may be broken, ``url`` its address;
+    None where that is not known.
     """
     if folder is not None:
         return [path for path, _ in _of(folder)]
     found = []
     for place in folders_of(config):
-        for path, told in _of(place):
-            wrong = told and (
-                (config is not None and told.get("config") != str(config.resolve()))
-                or (url is not None and told.get("url") != url)
+        for path, noted in _of(place):
+            wrong = noted and (
+                (config is not None and noted.get("config") != str(config.resolve()))
+                or (url is not None and noted.get("url") != url)
             )
-            if not wrong and (told or url is None):
+            if not wrong and (noted or url is None):
                 found.append(path)
     return found
 
 
-def ask(path: Path, line: str) -> dict[str, Any]:
+def request(path: Path, line: str) -> dict[str, Any]:
     """Send one line; return the daemon's answer.
 
-    Raises
-    ------
-    NoAnswer
-        If no program listens, or none that answers as a daemon does.
-    ValueError
-        With the daemon's own sentence, if it could not.
+    Raises NoAnswer if no program listens, or none that answers as a daemon does; ValueError: with the
+    daemon's own sentence, if it could not.
     """
     verb, _, rest = _answer(path, line).partition(" ")
     if verb == "failed:":
         raise ValueError(rest)
     try:
-        told = json.loads(rest)
+        answer = json.loads(rest)
     except (ValueError, RecursionError):
-        told = None
-    if not isinstance(told, dict) or verb != line.split()[0]:
+        answer = None
+    if not isinstance(answer, dict) or verb != line.split()[0]:
         raise NoAnswer(f"the program that listens at {path} does not answer as a daemon does")
-    return told
+    return answer
 
 
 def _answer(path: Path, line: str) -> str:
@@ -110,10 +100,10 @@ def _connect(peer: socket.socket, path: Path, until_s: float) -> None:
 
 def _of(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
     """The socket of a state folder, if there is one, and what is written down of its daemon."""
-    told: dict[str, Any] = {}
+    noted: dict[str, Any] = {}
     with contextlib.suppress(BadFile):
-        told = StateFile(folder / DAEMON_FILE, DAEMON_SCHEMA).read() or {}
-    path = Path(str(told.get("stop_socket") or folder / FILE))
+        noted = StateFile(folder / DAEMON_FILE, DAEMON_SCHEMA).read() or {}
+    path = Path(str(noted.get("stop_socket") or folder / FILE))
     with contextlib.suppress(OSError):
         if path.is_socket():
-            yield path, told
+            yield path, noted

@@ -35,27 +35,14 @@ POLL_S = 0.1  # how late the end is noticed
 class StopHandlers(Protocol):
     """What the socket carries out."""
 
-    def stop_told(self) -> StopTold:
-        """Stop the mast; return the answer."""
-
-    def estop(self, reason: str | None, name: str | None) -> EstopTold:
-        """Latch and stop; return the answer."""
+    def stop_answer(self) -> StopTold: ...
+    def estop(self, reason: str | None, name: str | None) -> EstopTold: ...
 
 
 class StopSocket:
-    """Listens at a path from its construction on, until `close`.
+    """Listens at a path from its construction on, until `close`. Raises MastctlError if it cannot.
 
-    Parameters
-    ----------
-    path
-        Where; a socket that a dead daemon has left there is replaced. Only this user may connect.
-    stops
-        What carries them out.
-
-    Raises
-    ------
-    MastctlError
-        If it cannot listen there.
+    A socket that a dead daemon has left at the path is replaced. Only this user may connect.
     """
 
     def __init__(self, path: Path, stops: StopHandlers) -> None:
@@ -156,7 +143,7 @@ class _Connection(socketserver.StreamRequestHandler):
         try:
             answer: StopTold | EstopTold
             if verb == "stop" and not rest:
-                answer = stops.stop_told()
+                answer = stops.stop_answer()
             elif verb == "estop":
                 name, colon, reason = rest.partition(":")
                 name, reason = (name, reason) if colon else ("", rest)

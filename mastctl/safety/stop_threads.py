@@ -27,7 +27,7 @@ class StopsHang(Unable):
 class StopThreads:
     """Daemon threads that run one call after the other; safe to use from any thread.
 
-    They wait for calls, never for ``clock``, which only tells how long one has been under way.
+    They wait for calls, never for ``clock``, by which a call is known to be overdue.
     """
 
     def __init__(self, threads: int = THREADS, clock: Clock | None = None) -> None:
@@ -41,10 +41,7 @@ class StopThreads:
     def submit(self, function: Callable[[], T]) -> Future[T]:
         """Run a function in the next free thread and return its future result; returns at once.
 
-        Raises
-        ------
-        StopsHang
-            If every thread has been in its call for longer than a stop may take.
+        Raises StopsHang if every thread has been in its call for longer than a stop may take.
         """
         now_s = self._clock.now_s()
         under_way_s = [now_s - began_s for began_s in self._began_s.copy().values()]

@@ -45,19 +45,13 @@ class MastInUse:
     data: bytes
     path: Path
 
-    def told(self) -> MastTold:
+    def as_json(self) -> MastTold:
         """Return its file, name and digest as JSON."""
         return {"file": self.path.name, "name": self.stored.rig.name, "digest": self.stored.digest}
 
 
 def read_mast(path: Path, config: Config) -> MastInUse:
-    """Read a mast file for a configuration.
-
-    Raises
-    ------
-    BadFile
-        If it cannot be used, or lacks a configured camera.
-    """
+    """Read a mast file for a configuration. Raises BadFile if it lacks a configured camera, too."""
     data = read_bytes(path, MAX_BYTES)
     stored = parse_rig(data, path)
     check_cameras(config, stored.rig)
@@ -65,23 +59,13 @@ def read_mast(path: Path, config: Config) -> MastInUse:
 
 
 def read_next(name: str, config: Config, now: MastInUse, sensor_modes: Mapping[str, SensorMode]) -> MastInUse:
-    """Read the mast file that shall take the place of another.
+    """Read the mast file that shall take the place of the one in use.
 
-    Parameters
-    ----------
-    name
-        Of a file in the folder of the configured mast file, without any folder.
-    config
-        Names the folder, and the cameras that it must have.
-    now
-        The one in use: configured cameras must be mounted alike and take images of the same size.
-    sensor_modes
-        Those of cameras that know it, which have to be the file's.
+    ``name``: of a file in the folder of the configured mast file, without any folder; ``now``: the one in
+    use: configured cameras must be mounted alike and take images of the same size; ``sensor_modes``: those of
+    cameras that know it, which have to be the file's.
 
-    Raises
-    ------
-    BadMastFile
-        If it may not, cannot be read, or does not fit.
+    Raises BadMastFile if it may not, cannot be read, or does not fit.
     """
     folder = config.mast_file.parent
     if Path(name).name != name or name.startswith(".") or "\\" in name or "\0" in name:
@@ -118,13 +102,13 @@ def _check_modes(mast: MastInUse, sensor_modes: Mapping[str, SensorMode]) -> Non
 
 
 def configured(rig: Rig, cameras: Iterable[str]) -> Rig:
-    """Return the part of a rig that this daemon can see with: nothing is aimed with a camera it lacks."""
+    """Return the part of a rig that is configured: nothing is aimed with a camera that is not there."""
     names = set(cameras)
     fit = {key: value for key, value in rig.fit.items() if key not in ("parameters", "covariance")}
     try:
         known = stored_covariance(rig)
     except CalibError as error:
-        log.warning("the calibration counts as exact: %s", error)
+        log.warning("the calibration is treated as exact: %s", error)
         known = None
     if known is not None:
         part = known.of(tuple(names))
@@ -133,7 +117,7 @@ def configured(rig: Rig, cameras: Iterable[str]) -> Rig:
         rig,
         fit=fit,
         cameras={name: camera for name, camera in rig.cameras.items() if name in names},
-        stereo={pair: eyes for pair, eyes in rig.stereo.items() if names.issuperset(eyes)},
+        stereo={pair: both for pair, both in rig.stereo.items() if names.issuperset(both)},
     )
 
 
@@ -159,23 +143,9 @@ def bounds_of(config: Config) -> Bounds:
 class Masts:
     """The mast files of one daemon; safe to use from any thread.
 
-    Parameters
-    ----------
-    config
-        Names the folder, and the cameras that each must have.
-    first
-        The one that the configuration names.
-    devices, operations
-        Ask the head whether it rests, and let what was stopped end before.
-    machine
-        Says whether anything runs; its publisher tells which is in use.
-    follow
-        Has everything use another one from now on.
+    ``first``: the one that the configuration names; ``follow``: has everything use another one from now on.
 
-    Attributes
-    ----------
-    in_use, former
-        Replaced as a whole, never edited; read without a lock.
+    ``in_use``, ``former``: replaced as a whole, never edited; read without a lock.
     """
 
     def __init__(
@@ -195,7 +165,7 @@ class Masts:
         self._machine = machine
         self._follow = follow
         self._lock = threading.Lock()
-        machine.publisher.publish("mast", "in_use", first.told())
+        machine.publisher.publish("mast", "in_use", first.as_json())
 
     @contextmanager
     def unchanged(self) -> Iterator[MastInUse]:
@@ -206,27 +176,17 @@ class Masts:
     def load(self, name: str) -> MastInUse:
         """Use another mast file of the configured one's folder from now on, and return it.
 
-        Frames taken before are refused from then on. The file before it stays at hand for `back`.
-
-        Raises
-        ------
-        BadMastFile
-            If it cannot be used; nothing has changed.
-        NotNow
-            ``busy``, ``moving``: if an operation runs or the head moves.
-        DriverError
-            If the head does not say whether it moves.
+        Frames taken before are refused from then on. The file before it stays at hand for `back`. Nothing has
+        changed where it raises: BadMastFile; NotNow ``busy``, ``moving``; DriverError if the head does not
+        answer.
         """
         return self._use(read_next(name, self._config, self.in_use, self._devices.sensor_modes))
 
     def back(self) -> MastInUse:
         """Go back to the mast file that was in use before, as it was then; the second time forth again.
 
-        Raises
-        ------
-        NotNow, DriverError, BadMastFile
-            ``no_former_mast`` if none was loaded since the start; else as for `load`, for a camera may
-            have joined in another mode.
+        Raises NotNow ``no_former_mast`` if none was loaded since the start; else as `load`, for a camera may
+        have joined in another mode.
         """
         former = self.former
         if former is None:
@@ -238,7 +198,7 @@ class Masts:
     def resting(self) -> Iterator[Callable[[MastInUse], None]]:
         """Let nothing start inside the block, which begins with a head that rests and nothing that runs.
 
-        What it gets puts another mast file into use. Raises NotNow ``busy``, ``moving``; DriverError.
+        It yields what puts another mast file into use. Raises NotNow ``busy``, ``moving``; DriverError.
         """
         self._operations.let_stopped_end()
         self._devices.read()  # the machine knows whether it moves now
@@ -260,7 +220,7 @@ class Masts:
     def _put(self, mast: MastInUse) -> None:
         self._follow(mast)
         self.in_use, self.former = mast, self.in_use
-        self._machine.publisher.publish("mast", "in_use", mast.told())
+        self._machine.publisher.publish("mast", "in_use", mast.as_json())
         for note in mast.stored.notes:
             log.warning("%s", note)
         log.info("mast file %s (%s) is in use", mast.path.name, mast.stored.digest[:12])

@@ -1,4 +1,4 @@
-"""Places of the head that people keep by a name: on the daemon's disk, so for everybody and every day."""
+"""Places of the head that people keep by a name, on the daemon's disk."""
 
 from __future__ import annotations
 
@@ -26,12 +26,7 @@ AT_HOME: HeadPlace = {"pan_rad": 0.0, "tilt_rad": 0.0}
 class Places:
     """The kept places of one daemon; safe to use from any thread.
 
-    Each call reads the disk: few ask, and what was kept by hand is seen too.
-
-    Parameters
-    ----------
-    folder
-        Where the daemon's state is kept.
+    Each call reads the disk: there are few, and what was kept by hand is seen too.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -47,12 +42,7 @@ class Places:
     def keep(self, name: str, place: HeadPlace) -> PlaceList:
         """Keep a place by a name, in the place of a former one, and return all.
 
-        Raises
-        ------
-        BadRequest
-            ``too_many_places``.
-        Unable
-            ``unreadable``, ``not_saved``.
+        Raises BadRequest ``too_many_places``; Unable ``unreadable``, ``not_saved``.
         """
         with self._writing:
             kept = self._read()
@@ -66,12 +56,7 @@ class Places:
     def forget(self, name: str) -> PlaceList:
         """Forget a place and return all that are left; a forgotten home is 0, 0 again.
 
-        Raises
-        ------
-        NotKnown
-            ``place_unknown``.
-        Unable
-            ``unreadable``, ``not_saved``.
+        Raises NotKnown ``place_unknown``; Unable ``unreadable``, ``not_saved``.
         """
         with self._writing:
             kept = self._read()
@@ -88,8 +73,8 @@ class Places:
         except BadFile as error:
             raise Unable("unreadable", str(error)) from None
         except (AttributeError, KeyError, TypeError, ValueError) as error:
-            words = f"{self._file.path}: places: {error!r} where pan_rad and tilt_rad of each are expected"
-            raise Unable("unreadable", words) from None
+            message = f"{self._file.path}: places: {error!r} where pan_rad and tilt_rad of each are expected"
+            raise Unable("unreadable", message) from None
 
     def _write(self, places: Mapping[str, HeadPlace]) -> None:
         try:

@@ -1,4 +1,4 @@
-"""The configuration read again: all of what it says now comes into use while the head rests, or nothing.
+"""The configuration read again: all of its changes come into use while the head rests, or none.
 
 What was opened at the start stays: drivers, cameras, the address, the state folder. A configuration that says
 something else of them is refused by key, and the daemon goes on as it was.
@@ -36,23 +36,14 @@ FIXED: Mapping[str, tuple[Callable[[Config], object], str]] = {
 
 
 def reload(service: Service) -> ReloadResult:
-    """Read the configuration's file again and use what it says; return what changed and what to know of it.
+    """Read the configuration's file again and use it; return what changed and what to know of it.
 
-    Returns
-    -------
-    dict
-        ``changed``: ``key``, ``before`` and ``after`` of each, as the files have them; ``mast``: the file in
-        use; ``notes``: sentences.
+    Returns ``changed``: ``key``, ``before`` and ``after`` of each, as the files have them; ``mast``: the file
+    in use; ``notes``: sentences. Nothing has changed where it raises.
 
-    Raises
-    ------
-    BadRequest
-        ``bad_config`` if the file is none that can be used, ``bad_mast_file``; nothing has changed.
-    NotNow
-        ``restart_needed`` if it says something else of what cannot change; ``busy``, ``moving`` if something
-        runs or the head moves; nothing has changed.
-    DriverError
-        If the head does not say whether it moves.
+    Raises BadRequest ``bad_config`` if the file is none that can be used, ``bad_mast_file``; NotNow
+    ``restart_needed`` if it has something else of what cannot change; ``busy``, ``moving`` if something runs
+    or the head moves; DriverError if the head does not say whether it moves.
     """
     with service.reloading:
         service.manager.reloading()
@@ -63,7 +54,7 @@ def reload(service: Service) -> ReloadResult:
 
 
 def _reload(service: Service) -> ReloadResult:
-    """Reload; nobody else does meanwhile."""
+    """Reload; no other request does meanwhile."""
     before = service.config
     try:
         after = load_config(before.path)
@@ -76,13 +67,13 @@ def _reload(service: Service) -> ReloadResult:
     with service.masts.resting() as use:
         try:
             service.use_config(after)
-        except BadOptions as error:  # the door has not taken the limits, and nothing else had its turn
+        except BadOptions as error:  # the judge has not taken the limits, and nothing else had its turn
             raise BadRequest("bad_config", " ".join(str(error).split())) from None
         if mast is not None:
             use(mast)
     changed = list(_changes(before, after))
     log.info("the configuration was read again: %s", ", ".join(one["key"] for one in changed) or "as it was")
-    return {"changed": changed, "mast": service.masts.in_use.told(), "notes": list(_notes(service))}
+    return {"changed": changed, "mast": service.masts.in_use.as_json(), "notes": list(_notes(service))}
 
 
 def _refuse_fixed(before: Config, after: Config) -> None:
@@ -90,10 +81,10 @@ def _refuse_fixed(before: Config, after: Config) -> None:
     was = parse_config(before.data, before.path) if before.data else before
     refused = [f"{key} ({why})" for key, (of, why) in FIXED.items() if of(was) != of(after)]
     if refused:
-        words = (
+        message = (
             f"{before.path} has another {', '.join(refused)}; nothing was changed: restart the daemon for it"
         )
-        raise NotNow("restart_needed", words)
+        raise NotNow("restart_needed", message)
 
 
 def _next_mast(before: Config, after: Config, service: Service) -> MastInUse | None:
@@ -136,5 +127,5 @@ def _notes(service: Service) -> Iterator[str]:
             limits.check(reading.pan_rad, reading.tilt_rad)
         except OutsideLimits as error:
             yield f"the head stands where it may not be sent any more: {error}; it may be sent back inside"
-    for fault in service.devices.door.faults(reading):
+    for fault in service.devices.judge.faults(reading):
         yield fault.message

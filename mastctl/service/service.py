@@ -1,12 +1,14 @@
-"""What a daemon holds, from the configuration to the last operation, without any web in it.
+"""What a daemon consists of, from the configuration to the last operation, without any web in it.
 
-Here the parts are made, each with those below it in hand, and closed again, the head first.
+Its parts are made, each with those below it in hand, and closed again, the head first.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import math
+import random
 import threading
 from collections.abc import Callable
 from dataclasses import asdict
@@ -17,6 +19,7 @@ from calib.files.mast_file import StoredRig
 from calib.matching.handed_over import MatchedHandoff
 from drivers.clock import Clock, SystemClock
 from drivers.hardware import Hardware, clock_for, head_name
+from drivers.simulation_clock import SimulationClock
 from mastctl.answers import CalibrationTold, Status, TrackTold
 from mastctl.as_json import as_json
 from mastctl.bench.operation import BenchOperation
@@ -25,20 +28,21 @@ from mastctl.config import Config
 from mastctl.control.audit import STRANGERS, STRANGERS_FILES, AuditLog
 from mastctl.control.entry import CommandEntry
 from mastctl.control.idempotency import Answers
-from mastctl.control.lease import LeaseTable, WhoSteers
+from mastctl.control.lease import LeaseTable, Steerer
 from mastctl.control.machine import StateMachine
 from mastctl.control.operations import OperationRunner
 from mastctl.control.publisher import Topic
 from mastctl.control.records import Operation, last_frame
 from mastctl.control.standing import StandingFault
 from mastctl.devices.devices import Devices
-from mastctl.devices.frames import OPERATIONS, StampedFrame, check_known
+from mastctl.devices.frames import OPERATIONS, StampedFrame, check_known, random_run
 from mastctl.devices.opening import open_rig
 from mastctl.errors import MastctlError
 from mastctl.motion.jog import Jogs
 from mastctl.motion.pairs import in_picture
+from mastctl.motion.poses import RoverPose
 from mastctl.motion.requests import wrong_camera
-from mastctl.motion.track import ACTIVE, RoverPose, TrackStatus
+from mastctl.motion.track import ACTIVE, TrackStatus
 from mastctl.motion.tracker import Tracker
 from mastctl.recorder.entries import AttachedMast
 from mastctl.recorder.recorder import Recorder
@@ -49,7 +53,6 @@ from mastctl.safety.state_folder import StateFolder
 from mastctl.safety.stop_socket import StopSocket
 from mastctl.safety.stop_threads import StopThreads
 from mastctl.service.masts import MastInUse, Masts, configured, read_mast
-from mastctl.service.opening import bounded, run_names
 from mastctl.service.places import Places
 from mastctl.service.state import (
     camera_answer,
@@ -81,18 +84,14 @@ KEPT_PICTURES = 8  # of a camera
 
 
 class Service:
-    """The devices, the pointing loop and the operations of one daemon; safe to use from any thread.
+    """The parts of one daemon; safe to use from any thread.
 
     Parameters
     ----------
-    config
-        The configuration.
     mast
         The mast file that the configuration names.
     hardware
         The opened drivers; closed by `close`.
-    clock
-        The clock that stamps everything.
     folder
         Where state is kept, closed by `close`.
     head
@@ -101,37 +100,22 @@ class Service:
     Attributes
     ----------
     machine
-        What the daemon is doing; its publisher tells every change.
-    devices, operations, tracker
-        The head and the cameras, what runs, and what is followed with the rover's pose.
-    masts
-        The mast file in use, and the one before it.
-    steering, jogs, stopping
-        Where the head is sent, turned by hand, and stopped.
-    handoffs, health, sentinel
-        The drift watch: offsets of hand-offs, the verdict of residuals, and the result of reference images.
-    journals
-        The thread that reads and writes their files.
+        What the daemon is doing; its publisher gets every change.
+    handoffs, health, sentinel, journals
+        The drift watch: offsets of hand-offs, the verdict of residuals, and the result of reference images;
+        the thread that reads and writes their files.
     entry, leases, audit, strangers
-        Where each command passes, who steers, and what is recorded of it; of strangers' elsewhere.
-    metrics
-        What is counted, for Prometheus.
-    recorder
-        Records what is published; begins and ends runs.
+        Where each command passes, which client steers, and what is recorded of it; of strangers' elsewhere.
     stop_threads
         Where the web side stops: threads that nothing else can keep busy.
-    folder, head_folder
-        Where state is kept that outlives the daemon; the head's own place, None for one in memory.
-    latch
-        The emergency stops that are latched.
-    places
-        Where the head is sent by a name.
     bench, reports
         Bench calibrations, and the reports that are shown.
+    head_folder
+        The head's own place, None for one in memory.
     manager
-        What started this process, and hears when the configuration is read again; nobody by default.
+        What started this process, and is informed of a reload; none by default.
     reloading
-        Held while the configuration is read again.
+        Locked while the configuration is read again.
     stop_socket
         The Unix socket for stops alone, once `open_stop_socket` was called.
     """
@@ -174,13 +158,13 @@ class Service:
             self.event_value,
             clock,
         )
-        people_s = SystemClock()  # clients live in real time, whatever a simulated rover's clock does
-        self.leases = LeaseTable(people_s, self.machine.something_runs, self._steered, self.stopping.stop)
+        real_time = SystemClock()  # clients live in it, whatever a simulated rover's clock does
+        self.leases = LeaseTable(real_time, self.machine.something_runs, self._steered, self.stopping.stop)
         threading.Thread(target=self.leases.watch, name="leases", daemon=True).start()
         self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)
         strangers = self.folder.path / STRANGERS_FILE
         self.strangers = AuditLog(strangers, clock, files=STRANGERS_FILES, device=STRANGERS)
-        answers = Answers(people_s, clock)
+        answers = Answers(real_time, clock)
         self.entry = CommandEntry(
             clock, self.leases, answers, self.audit, self.operations, publisher, self.strangers
         )
@@ -213,7 +197,7 @@ class Service:
     def _open_head(self, mast: MastInUse) -> None:
         """Make what moves the head, and what stops it."""
         config, clock, machine = self.config, self.clock, self.machine
-        new_run = run_names(self.hardware, clock)
+        new_run = _run_names(self.hardware, clock)
         self.devices = Devices(
             self.hardware,
             config.limits,
@@ -253,22 +237,15 @@ class Service:
             self.operations,
             self.devices,
             clock,
-            undisturbed=self.masts.unchanged,
-            last_stop=lambda: self.leases.last_stop,
+            self.masts.unchanged,
         )
 
     @classmethod
     def open(cls, config: Config, clock: Clock | None = None, folder: StateFolder | None = None) -> Service:
         """Read the mast file, open the hardware, and return the running service.
 
-        Raises
-        ------
-        BadFile
-            If the mast file cannot be used, or lacks a configured camera.
-        DriverError
-            If a driver refuses its options or cannot reach its device.
-        StateInUse
-            If another program drives the head.
+        Raises BadFile if the mast file cannot be used, or lacks a configured camera; DriverError if a driver
+        refuses its options or cannot reach its device; StateInUse if another program drives the head.
         """
         clock = clock or clock_for(config.hardware)
         mast = read_mast(config.mast_file, config)
@@ -308,12 +285,12 @@ class Service:
             "joints": None if reading is None else joints_answer(reading, now_s),
             "axes": {
                 name: {"count_rad": axis.count_rad, "one_sided": axis.rising_below_rad is not None}
-                for name, axis in self.devices.door.axes.items()
+                for name, axis in self.devices.judge.axes.items()
             },
             "limits": as_json(self.config.limits),
-            "pose": None if track.pose is None else track.pose.told(now_s),
+            "pose": None if track.pose is None else track.pose.as_json(now_s),
             "track": {"state": track.state, "reason": track.reason, "id": track.id},
-            "control": self.leases.told(),
+            "control": self.leases.as_json(),
             "stop_socket": None if self.stop_socket is None else str(self.stop_socket.path),
             "calibration": self.mast_verdict(),
             "sentinel": self.sentinel.summary(),
@@ -321,8 +298,8 @@ class Service:
                 name: camera_answer(frame, now_s) for name, frame in self.devices.newest_frames().items()
             },
             "faults": [fault_answer(fault, now_s) for fault in faults],
-            "mast": self.masts.in_use.told(),
-            "former_mast": None if former is None else former.told(),
+            "mast": self.masts.in_use.as_json(),
+            "former_mast": None if former is None else former.as_json(),
             "version": self._version,
             "now_s": now_s,
             "uptime_s": now_s - self.started_s,
@@ -331,19 +308,19 @@ class Service:
     def event_value(self, topic: Topic, value: Any) -> Any:
         """Return a published value as events and recordings have it."""
         if topic == "track":
-            return self.track_told(value)
+            return self.track_answer(value)
         if topic == "lease":
-            return {"control": self.leases.told()}
+            return {"control": self.leases.as_json()}
         return event_value(topic, value, self.clock.now_s())
 
     def mast_verdict(self) -> CalibrationTold:
         """Return whether the mast file still holds, by all three kinds of evidence."""
         return mast_verdict(self.health.verdict, self.sentinel.summary(), self.handoffs.summary())
 
-    def track_told(self, status: TrackStatus | None = None) -> TrackTold:
+    def track_answer(self, status: TrackStatus | None = None) -> TrackTold:
         """Return the track, as it is or was, and the self-check of now as ``GET /track`` tells them."""
-        told = (status or self.tracker.status).told(self.clock.now_s())
-        return {**told, "self_check": self.handoffs.summary()}
+        track = (status or self.tracker.status).as_json(self.clock.now_s())
+        return {**track, "self_check": self.handoffs.summary()}
 
     def track_in(self, frame: StampedFrame) -> dict[str, float] | None:
         """Return where a frame should show the track's target, pixels, with one sigma as an ellipse.
@@ -360,10 +337,7 @@ class Service:
     def snapshot(self, camera: str, fresh: bool) -> StampedFrame:
         """Return a frame exposed after this call (``fresh``), or one that is at most a second old.
 
-        Raises
-        ------
-        NotKnown, DriverError
-            As `mastctl.devices.devices.Devices.frames`.
+        Raises NotKnown, DriverError: as `mastctl.devices.devices.Devices.frames`.
         """
         now_s = self.clock.now_s()
         after_s = now_s if fresh else now_s - SNAPSHOT_AGE_S
@@ -376,10 +350,8 @@ class Service:
     def kept_frame(self, camera: str, frame_id: str) -> StampedFrame:
         """Return a frame that is still kept, by its id.
 
-        Raises
-        ------
-        NotKnown, NoLonger, NotNow, BadRequest
-            If it is not kept, is of another camera, or there is no such camera.
+        Raises NotKnown, NoLonger, NotNow, BadRequest if it is not kept, is of another camera, or there is no
+        such camera.
         """
         self.check_camera(camera)
         frame = self.devices.frame_by_id(frame_id)
@@ -415,7 +387,7 @@ class Service:
             self.stop_threads.close,
             self.journals.close,
             self.recorder.close,
-            lambda: bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S),
+            lambda: _bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S),
             *(one.close for one in maybe if one is not None),
         )
         with contextlib.ExitStack() as rest:  # none is skipped, whatever ends another one
@@ -438,17 +410,14 @@ class Service:
     def use_config(self, config: Config) -> None:
         """Use another configuration of the same devices while nothing runs; the limits first.
 
-        Raises
-        ------
-        BadOptions
-            If the head does not keep its limits; nothing has changed.
+        Raises BadOptions if the head does not keep its limits; nothing has changed.
         """
-        self.devices.door.use_limits(config.limits)
+        self.devices.judge.use_limits(config.limits)
         if config.sun != self.config.sun:
-            self.devices.door.use_sun(config.sun)
+            self.devices.judge.use_sun(config.sun)
         self.config = config
-        self.steering.repeat_after_s = config.repeat_after_s
-        self.steering.use_rig(configured(self.stored.rig, config.hardware.cameras))
+        rig = configured(self.stored.rig, config.hardware.cameras)
+        self.steering.use_rig(rig, config.repeat_after_s)
         self.tracker.use_settings(config.limits, config.tracking)
         self.recorder.use_settings(config.record, [Attached(config.path.name, config.data)])
         self.masts.use_config(config)
@@ -458,18 +427,18 @@ class Service:
         stored = mast.stored
         rig = configured(stored.rig, self.config.hardware.cameras)
         self.devices.use_rig(stored.rig, stored.digest)
-        self.steering.use_rig(rig)
+        self.steering.use_rig(rig, self.config.repeat_after_s)
         self.tracker.use_rig(rig, mast.path.name)
         self.handoffs.use_mast(stored.digest)
         self.health.use_mast(stored)
 
-    def _steered(self, control: WhoSteers | None) -> None:
-        """Publish who holds the lease."""
-        told = None if control is None else asdict(control)
-        self.machine.publisher.publish("lease", "lease", told)
+    def _steered(self, control: Steerer | None) -> None:
+        """Publish which client steers."""
+        value = None if control is None else asdict(control)
+        self.machine.publisher.publish("lease", "lease", value)
 
     def _ended(self, operation: Operation) -> None:
-        """Have an operation's end recorded, and its last picture kept for who looks at it later."""
+        """Have an operation's end recorded, and its last image kept for later."""
         self.entry.ended(operation.id, operation.state, operation.error)
         frame_id = last_frame(operation.result)
         if frame_id is not None:
@@ -493,3 +462,28 @@ def _tried(close: Callable[[], object]) -> None:
         close()
     except Exception:
         log.exception("a part of the daemon could not be closed")
+
+
+def _run_names(hardware: Hardware, clock: Clock) -> Callable[[], str]:
+    """Return what makes a part of ids: random, or the same ones in every run that shall be the same."""
+    simulation = hardware.simulation
+    if simulation is None or not isinstance(clock, SimulationClock) or math.isfinite(clock.speed):
+        return random_run
+    seeded = random.Random(simulation.settings.camera.seed)
+    return lambda: f"{seeded.getrandbits(16):04x}"
+
+
+def _bounded(what: str, function: Callable[[], None], timeout_s: float) -> None:
+    """Run something that may hang or raise; go on after ``timeout_s`` seconds at the latest."""
+
+    def run() -> None:
+        try:
+            function()
+        except Exception:  # the last thing done with a driver; nothing is left to protect but the exit
+            log.exception("%s failed", what)
+
+    thread = threading.Thread(target=run, name=what, daemon=True)
+    thread.start()
+    thread.join(timeout_s)
+    if thread.is_alive():
+        log.error("%s did not end within %.0f s and is left behind", what, timeout_s)

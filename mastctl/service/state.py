@@ -15,7 +15,7 @@ from mastctl.devices.joint_history import HeadReading
 def standing_answer(now: Standing, now_s: float) -> StandingTold:
     """Return what the daemon is doing."""
     return {
-        "state": now.word,
+        "state": now.state,
         "reason": now.reason,
         "state_for_s": max(0.0, now_s - now.since_s),
         "estop": as_json(now.latched[0]) if now.latched else None,
@@ -28,7 +28,7 @@ def standing_answer(now: Standing, now_s: float) -> StandingTold:
 
 def state_answer(now: Standing, now_s: float) -> StateTold:
     """Return what the daemon is doing, with its track and whether the head moves."""
-    return {**standing_answer(now, now_s), "track": now.track, "moving": now.head_moves}
+    return {**standing_answer(now, now_s), "track": now.track, "moving": bool(now.head_moves)}
 
 
 def camera_answer(frame: StampedFrame | None, now_s: float) -> CameraTold:
@@ -88,7 +88,7 @@ def event_value(topic: Topic, value: Any, now_s: float) -> Any:
         case "frame":
             return as_json(value) | {"age_s": max(0.0, now_s - value.mid_exposure_s)}
         case "operation":
-            return value.told()
+            return value.as_json()
         case "command":  # without the key, by which others would get the answer, and a lease with it
             return {name: one for name, one in value.items() if name != "key"}
         case _:

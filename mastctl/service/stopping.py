@@ -30,14 +30,7 @@ STATE = "state"
 class Stopping:
     """What ends every motion of one daemon; safe to use from any thread.
 
-    Parameters
-    ----------
-    devices, operations, tracker
-        What is stopped, in this order.
-    machine
-        Is told.
-    latch
-        What outlives the daemon of emergency stops. Those that are found latched hold from the start.
+    ``latch`` is what outlives the daemon of emergency stops; what is found latched counts from the start.
     """
 
     def __init__(
@@ -62,15 +55,10 @@ class Stopping:
 
         Raises DriverError.
         """
-        with self._operations.held():  # until the track has ended too, which would look again
-            try:
-                stopped = self._operations.stop(reason, reason_follows)
-            finally:
-                self._tracker.stop(reason)
-        return stopped
+        return self._operations.stop(reason, reason_follows, lambda: self._tracker.stop(reason))
 
-    def stop_told(self) -> StopTold:
-        """Stop as `stop`; return what ``POST /stop`` tells."""
+    def stop_answer(self) -> StopTold:
+        """Stop as `stop`; return the answer of ``POST /stop``."""
         return {"stopped": True, "operation": self.stop()}
 
     def stop_track(self) -> None:
@@ -87,65 +75,58 @@ class Stopping:
     ) -> EstopTold:
         """Stop the mast, and let nothing move it before `reset`, across restarts too.
 
-        The head first; then what runs and the track end; then it is told whether the disk holds the stop.
-        If its ``reason_follows``, `explain_estop` comes next, with a reason or without.
+        The head first; then what runs and the track end; then the disk is waited for. If its
+        ``reason_follows``, `explain_estop` comes next, with a reason or without.
 
-        Returns
-        -------
-        dict
-            As ``POST /estop`` tells it: ``latched``, ``kept`` (a restart would find it; else ``message`` says
-            why not), ``operation``, and ``reason``, ``name`` and ``at`` of the stop that is latched.
-
-        Raises
-        ------
-        Unable
-            ``stop_unconfirmed`` if the head did not confirm; the stop is latched all the same.
+        Returns the answer of ``POST /estop``: ``latched``, ``kept`` (a restart would find it; else
+        ``message`` says why not), ``operation``, and ``reason``, ``name`` and ``at`` of the stop that is
+        latched. Raises Unable ``stop_unconfirmed`` if the head did not confirm; it is latched all the same.
         """
         stopped, unconfirmed = None, None
         with self._operations.held():
-            held = self.latch_estop(reason, name)
+            cause = self.latch_estop(reason, name)
             try:
-                stopped = self.stop(f"an emergency stop: {held.reason} ({held.name})", reason_follows)
+                stopped = self.stop(f"an emergency stop: {cause.reason} ({cause.name})", reason_follows)
             except (DriverError, MastctlError) as error:
                 unconfirmed = error
-        self._latch.head_told()
+        self._latch.head_stopped()
         kept = self._latch.kept_within(KEPT_S)
         why = "" if kept else f"it would not survive a restart of the daemon: {self._latch.not_kept}"
         if unconfirmed is not None:
-            words = f"the emergency stop is latched, but the head did not confirm it: {unconfirmed}"
-            raise Unable("stop_unconfirmed", f"{words}; {why}" if why else words)
-        told: EstopTold = {
+            message = f"the emergency stop is latched, but the head did not confirm it: {unconfirmed}"
+            raise Unable("stop_unconfirmed", f"{message}; {why}" if why else message)
+        answer: EstopTold = {
             "stopped": True,
             "latched": True,
             "kept": kept,
             "operation": stopped,
-            "reason": held.reason,
-            "name": held.name,
-            "at": held.at,
+            "reason": cause.reason,
+            "name": cause.name,
+            "at": cause.at,
         }
         if why:
-            told["message"] = why
-        return told
+            answer["message"] = why
+        return answer
 
     def latch_estop(self, reason: str | None, name: str | None) -> Latched:
-        """Let no move out from now on; the head is told by `estop`. Returns the stop that is latched."""
-        self._machine.stop_asked()
+        """Let no move out from now on; `estop` stops the head. Returns the cause that is latched."""
+        self._machine.stop_requested()
         try:
-            held = self._latch.hold(reason, name)
-            self._machine.estop_asked(self._causes)
+            cause = self._latch.hold(reason, name)
+            self._machine.estop_requested(self._causes)
             self._block_moves()
         finally:
             self._machine.stop_ended()
-        return held
+        return cause
 
     def explain_estop(self, reason: str | None, name: str | None) -> Latched | None:
         """Add the name and the reason that came after their stop; return its cause if that has changed."""
         cause, sentence = self._latch.explain(reason, name) if reason or name else None, None
         if cause is not None:  # else there is none left to explain, after a reset for example
             sentence = f"an emergency stop: {cause.reason} ({cause.name})"
-            self._machine.stop_asked()
+            self._machine.stop_requested()
             try:
-                self._machine.estop_asked(self._causes)
+                self._machine.estop_requested(self._causes)
                 self._block_moves()
             finally:
                 self._machine.stop_ended()
@@ -155,22 +136,11 @@ class Stopping:
     def reset(self, reason: str, name: str) -> ResetTold:
         """Release the emergency stop; nothing moves before a command comes.
 
-        Parameters
-        ----------
-        reason, name
-            Why, and who says so.
+        Returns the answer of ``POST /reset``: the first cause that is ``released``, and whether another came
+        since.
 
-        Returns
-        -------
-        dict
-            As ``POST /reset`` answers: the first cause that is ``released``, and whether another came since.
-
-        Raises
-        ------
-        NotNow
-            ``not_estopped`` if none is latched, ``stopping`` if a stop is still under way after 1 s.
-        Unable
-            ``not_saved`` if the state folder goes on to say that it is latched; ``closing``.
+        Raises NotNow ``not_estopped`` if none is latched, ``stopping`` if a stop is still under way after 1
+        s; Unable ``not_saved`` if the disk refuses the release; ``closing``.
         """
         refusal = self._operations.refusal("latch")
         if refusal is not None:
@@ -181,7 +151,7 @@ class Stopping:
             causes = self._latch.release(reason, name)
             self._block_moves()
             self._machine.reset(name, reason, self._causes)
-            return {"latched": bool(self._latch.entries), "released": causes[0].told()}
+            return {"latched": bool(self._latch.entries), "released": causes[0].as_json()}
 
     def _causes(self) -> tuple[Latched, ...]:
         return self._latch.entries
@@ -196,50 +166,34 @@ class Stopping:
 
 
 def state_faults(folder: StateFolder, latch: Latch, started_s: float) -> Iterator[StandingFault]:
-    """Yield what keeps state from outliving the daemon, where it should.
-
-    Parameters
-    ----------
-    folder, latch
-        Where state is kept, and the emergency stop.
-    started_s
-        When the daemon started.
-    """
+    """Yield what keeps state from outliving a daemon that ``started_s``, where it should."""
     if folder.why_temporary:
         above = ", an emergency stop above all" if latch.folder is folder else ", but for an emergency stop"
-        words = f"nothing outlives this daemon{above}: {folder.why_temporary}"
-        yield StandingFault(STATE, "state_not_kept", words, started_s, "the daemon has a state folder")
-    elif folder.refused and latch.folder is folder and latch.held is None:
-        words = f"an emergency stop would not survive a restart: {folder.refused}"
-        yield StandingFault(STATE, "state_not_kept", words, started_s, "the daemon is started again")
+        message = f"nothing outlives this daemon{above}: {folder.why_temporary}"
+        yield StandingFault(STATE, "state_not_kept", message, started_s, "the daemon has a state folder")
+    elif folder.refused and latch.folder is folder and not latch.entries:
+        message = f"an emergency stop would not survive a restart: {folder.refused}"
+        yield StandingFault(STATE, "state_not_kept", message, started_s, "the daemon is started again")
     elif latch.not_kept and not latch.folder.is_temporary:
-        words = f"the emergency stop is held in memory only: {latch.not_kept}"
-        yield StandingFault(STATE, "latch_not_kept", words, latch.since_s, "the disk takes it, or a reset")
+        message = f"the emergency stop is held in memory only: {latch.not_kept}"
+        yield StandingFault(STATE, "latch_not_kept", message, latch.since_s, "the disk takes it, or a reset")
 
 
 VIA = "stop socket"
 
 
 class SocketStops:
-    """Stops that come by a daemon's socket.
-
-    Parameters
-    ----------
-    stops
-        Carries them out.
-    entry
-        Records them.
-    """
+    """Stops that come by a daemon's socket: carried out by ``stops``, recorded by ``entry``."""
 
     def __init__(self, stops: StopHandlers, entry: CommandEntry) -> None:
         self._stops = stops
         self._entry = entry
 
-    def stop_told(self) -> StopTold:
+    def stop_answer(self) -> StopTold:
         """Stop the mast; return the answer."""
-        return self._entry.first(STOP, CommandRequest(Caller(role="view", via=VIA)), self._stops.stop_told)
+        return self._entry.first(STOP, CommandRequest(Caller(role="view", via=VIA)), self._stops.stop_answer)
 
     def estop(self, reason: str | None, name: str | None) -> EstopTold:
         """Latch and stop; return the answer."""
-        asked = CommandRequest(Caller(role="view", via=VIA), request={"reason": reason, "name": name})
-        return self._entry.first(ESTOP, asked, lambda: self._stops.estop(reason, name))
+        sent = CommandRequest(Caller(role="view", via=VIA), request={"reason": reason, "name": name})
+        return self._entry.first(ESTOP, sent, lambda: self._stops.estop(reason, name))

@@ -66,7 +66,7 @@ class CameraCheck:
     def problems(self, promise: str | None = None) -> list[str]:
         """Return what was found against a promise, or against any.
 
-        Promises are ``frames`` (each can be true), ``fresh`` (none is from before the asked moment),
+        Promises are ``frames`` (each can be true), ``fresh`` (none is from before the requested moment),
         ``order`` (count and time grow together), ``refusal`` (what cannot come is refused in time) and
         ``stated`` (what the camera states of itself).
         """

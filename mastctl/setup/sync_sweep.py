@@ -154,7 +154,7 @@ class Sweep:
         for side in (-1, 1):
             goal = start.pan_rad + side * plan.amplitude_rad, start.tilt_rad
             self._limits.check(*goal)
-            self._devices.door.check_move(goal, lambda: start)
+            self._devices.judge.check_move(goal, lambda: start)
         self._limits.speed(plan.speed_rad_per_s)
         threads = [
             self._clock.thread(partial(self._watch, name, start, plan), f"sweep {name}")

@@ -21,7 +21,7 @@ from mastctl.config import Config, Listen, load_config, not_simulated
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.frames import camera_and_sequence
 from mastctl.errors import NotKnown, NotNow
-from mastctl.motion.track import RoverPose
+from mastctl.motion.poses import RoverPose
 
 USUAL = {"samples": 1, "speed": "max"}
 
@@ -87,7 +87,7 @@ class Daemons:
         return pixel if all(map(math.isfinite, pixel)) else None
 
     def _do_pose(self) -> tuple[list[float], list[float]]:
-        pose = RoverPose(self._rover.site_from_rover).told(0.0)
+        pose = RoverPose(self._rover.site_from_rover).as_json(0.0)
         return pose["position_m"], pose["quaternion"]
 
     def _do_stand(self, place: list[float]) -> None:

@@ -115,7 +115,7 @@ class Metrics:
     def _operation(self, operation: Operation) -> None:
         if operation.state not in ENDED:
             return
-        record = operation.told()
+        record = operation.as_json()
         error = record["error"]
         self._operations.labels(operation.state, "" if error is None else error["code"]).inc()
         for step in record["steps"]:

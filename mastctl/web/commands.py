@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from inspect import Parameter
@@ -18,9 +18,9 @@ from mastctl.control.entry import Command, CommandRequest
 from mastctl.control.idempotency import Answer
 from mastctl.errors import Unable
 from mastctl.http import PREFIX
+from mastctl.motion.requests import DeadlineS
 from mastctl.safety.stop_threads import StopsHang
 from mastctl.service.service import Service
-from mastctl.web.models import DeadlineS
 from mastctl.web.parts import Here, Parts
 
 T = TypeVar("T")
@@ -142,15 +142,27 @@ async def stop_first(
     request: Request,
     act: Callable[[], Answer],
     told: Mapping[str, Any] = NOTHING,
+    late: Callable[[], Awaitable[Mapping[str, Any]]] | None = None,
 ) -> Answer:
-    """Return the answer of a stop: nothing is asked and no header is judged before it acts."""
+    """Return the answer of a stop: nothing is asked and no header is judged before it acts.
+
+    ``late`` returns what was ``told`` after that; the stop is recorded with it then.
+    """
     asked = CommandRequest(caller_of(request), request=told, lease=request.headers.get("mastctl-lease"))
-    entry = here.service.entry
+    entry, answer, failure = here.service.entry, None, None
     try:
-        return await stopped(here.service, lambda: entry.first(kind, asked, act))
-    except StopsHang as error:
-        entry.note(kind, asked, error)
+        answer = await stopped(here.service, lambda: entry.first(kind, asked, act, late is None))
+        return answer
+    except BaseException as error:
+        failure = error
         raise
+    finally:
+        try:
+            if late is not None:
+                asked = replace(asked, request=await late())
+        finally:
+            if late is not None or isinstance(failure, StopsHang):
+                entry.note(kind, asked, answer, failure)
 
 
 async def stopped(service: Service, stop: Callable[[], T]) -> T:

@@ -82,7 +82,7 @@ def _event(service: Service, one: Published, lost: int) -> str:
 
 
 def _track(service: Service, one: Published, lost: int) -> str:
-    return json.dumps(writable(service.track_told(one.value)), allow_nan=False)
+    return json.dumps(writable(service.track_answer(one.value)), allow_nan=False)
 
 
 class _Lines(StreamingResponse):

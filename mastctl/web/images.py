@@ -88,12 +88,12 @@ def add_cameras(app: FastAPI) -> None:
         "Change some of a camera's settings, each with its automatic turned off",
     )
     def change(camera: str, body: CameraSettingsBody, here: Here) -> CameraSettingsTold:
-        return _settings(here, camera, here.service.devices.set_camera(camera, body.wanted))
+        return _settings(here, camera, here.service.devices.settings.change(camera, body.wanted))
 
 
 def _settings(here: Parts, camera: str, notes: list[str]) -> CameraSettingsTold:
     devices = here.service.devices
-    found, fixed = devices.camera_settings(camera)
+    found, fixed = devices.settings.of(camera)
     mode = devices.sensor_modes.get(camera)
     return {
         "camera": camera,

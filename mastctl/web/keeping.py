@@ -104,7 +104,7 @@ def add_masts(app: FastAPI) -> None:
 
 def _masts_told(masts: Masts, mast: MastInUse) -> MastChange:
     former = masts.former
-    return {"mast": mast.told(), "former_mast": None if former is None else former.told()}
+    return {"mast": mast.as_json(), "former_mast": None if former is None else former.as_json()}
 
 
 def add_places(app: FastAPI) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property
 from typing import Annotated, Any, Literal, Self, cast
 
 import numpy as np
@@ -11,44 +10,18 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
 from calib.geometry.rigid import Rigid, rotation_of
-from mastctl.control.entry import LONGEST_DEADLINE_S
 from mastctl.control.lease import LONGEST_S, SHORTEST_S, USUAL_S
 from mastctl.control.publisher import TOPICS, Topic
 from mastctl.devices.limits import LEAST_CONE_RAD, WIDEST_CONE_RAD, SunDirection, direction_of
-from mastctl.motion.jog import Beat
-from mastctl.motion.requests import (
-    LARGEST_M,
-    LARGEST_PX,
-    Aim,
-    Angle,
-    AnglesTarget,
-    Metres,
-    Name,
-    PixelTarget,
-    PlaneTarget,
-    Pointings,
-    PointRequest,
-    PositionTarget,
-    Range,
-    Target,
-)
-from mastctl.motion.track import RoverPose
+from mastctl.motion.poses import RoverPose
+from mastctl.motion.requests import LARGEST_M, LARGEST_PX, Angle, Metres, Name, Place, StrictBody
 from mastctl.safety.latch import LONGEST
 
-Rate = Annotated[float, Field(ge=-100.0, le=100.0)]
 Slope = Annotated[float, Field(ge=-1.0, le=1.0)]
 Sigma = Annotated[float, Field(ge=0.0, le=LARGEST_M)]
 Part = Annotated[float, Field(ge=-1e9, le=1e9)]
 LeaseS = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
-DeadlineS = Annotated[float, Field(gt=0.0, le=LONGEST_DEADLINE_S, allow_inf_nan=False)]
 MOST_KEYS = 16
-Place = Annotated[list[Metres], Field(min_length=3, max_length=3)]
-
-
-class _Strict(BaseModel):
-    """Unknown keys, wrong types and numbers that are not finite are refused."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
 
 
 Words = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=LONGEST)]
@@ -61,14 +34,14 @@ class EstopBody(BaseModel):
     name: str | None = None
 
 
-class ResetBody(_Strict):
+class ResetBody(StrictBody):
     """``POST /reset``: why and by whom the stop is released."""
 
     reason: Words
     name: Words
 
 
-class LeaseBody(_Strict):
+class LeaseBody(StrictBody):
     """``POST /lease``: how long, and whose it is, if not the caller's.
 
     ``ends_with_stop``: it ends with the next stop of the head.
@@ -79,7 +52,7 @@ class LeaseBody(_Strict):
     ends_with_stop: bool = False
 
 
-class RenewBody(_Strict):
+class RenewBody(StrictBody):
     """``POST /lease/renew``: how long from now on; as long as at first when left out."""
 
     for_s: LeaseS | None = None
@@ -93,7 +66,7 @@ class TakeBody(LeaseBody):
     ]
 
 
-class CameraSettingsBody(_Strict):
+class CameraSettingsBody(StrictBody):
     """``PATCH /cameras/{camera}/settings``: what is to change; one at least."""
 
     exposure_s: float | None = None
@@ -113,107 +86,20 @@ class CameraSettingsBody(_Strict):
         return self.model_dump(exclude_none=True)
 
 
-class RecordBody(_Strict):
+class RecordBody(StrictBody):
     """``POST /recordings/start``: a word for the file's name."""
 
     name: Annotated[str, Field(max_length=60)] = ""
 
 
-class TrackBody(_Strict):
-    """``POST /track``: exactly one of pixel and position_m."""
-
-    deadline_s: DeadlineS | None = None
-    pixel: PixelTarget | None = None
-    position_m: Place | None = None
-    frame: Literal["rover", "site"] | None = None
-
-    @model_validator(mode="after")
-    def _whole(self) -> Self:
-        if self.frame is not None and self.position_m is None:
-            raise ValueError("frame goes with position_m only")
-        self._check_targets()
-        return self
-
-    def _check_targets(self) -> None:
-        """Pass exactly one target. Raises ValueError."""
-        if (self.pixel is None) == (self.position_m is None):
-            raise ValueError("exactly one of pixel and position_m is expected")
-
-    def target(self) -> PixelTarget | PositionTarget:
-        """Return it as the tracker takes it."""
-        if self.pixel is not None:
-            return self.pixel
-        assert self.position_m is not None
-        x, y, z = self.position_m
-        return PositionTarget((x, y, z), self.frame or "rover")
-
-
-class PointBody(TrackBody):
-    """``POST /point``: exactly one of pixel, position_m, or pan_rad with tilt_rad."""
-
-    pan_rad: Angle | None = None
-    tilt_rad: Angle | None = None
-    aim: Aim | None = None
-    pointings: Pointings = 1
-    range_m: Range | None = None
-    plane: PlaneTarget | None = None
-
-    def _check_targets(self) -> None:
-        """Pass exactly one target, and what goes with it. Raises ValueError."""
-        angles = (self.pan_rad is not None) + (self.tilt_rad is not None)
-        targets = (self.pixel is not None) + (self.position_m is not None) + (angles > 0)
-        if targets != 1:
-            raise ValueError(
-                f"{targets} targets where exactly one of pixel, position_m, pan_rad with tilt_rad is expected"
-            )
-        if angles == 1:
-            missing = "tilt_rad" if self.tilt_rad is None else "pan_rad"
-            raise ValueError(f"{missing} is missing; pan_rad and tilt_rad go together")
-        _ = self.request
-
-    @cached_property
-    def request(self) -> PointRequest:
-        """It as the pointing loop takes it. Raises ValueError."""
-        target: Target
-        if self.pan_rad is None or self.tilt_rad is None:
-            target = self.target()
-        else:
-            target = AnglesTarget(self.pan_rad, self.tilt_rad)
-        return PointRequest(target, self.aim, self.pointings, self.range_m, self.plane)
-
-    @property
-    def looks(self) -> int:
-        """How many pictures it takes."""
-        return 0 if isinstance(self.request.target, AnglesTarget) else self.pointings
-
-
-class PreviewBody(_Strict):
-    """``POST /point/preview``: a pixel of a named frame, and where it would come."""
-
-    pixel: PixelTarget
-    aim: Aim | None = None
-    range_m: Range | None = None
-    plane: PlaneTarget | None = None
-
-    @model_validator(mode="after")
-    def _whole(self) -> Self:
-        _ = self.request
-        return self
-
-    @cached_property
-    def request(self) -> PointRequest:
-        """It as the pointing loop takes it. Raises ValueError."""
-        return PointRequest(self.pixel, self.aim, range_m=self.range_m, plane=self.plane)
-
-
-class SigmaBody(_Strict):
+class SigmaBody(StrictBody):
     """One sigma of each axis of a motion: of its translation, metres, and of its rotation, radians."""
 
     position_m: Sigma
     rotation_rad: Annotated[float, Field(ge=0.0, le=math.pi)]
 
 
-class PoseBody(_Strict):
+class PoseBody(StrictBody):
     """``POST /pose``: site_from_rover, and how well the motion since the pose before is known.
 
     ``covariance`` has its rows and columns in the order x, y, z, turn about x, about y, about z: metres and
@@ -270,24 +156,7 @@ def _check_covariance(rows: list[list[float]]) -> None:
         raise ValueError(_NEGATIVE)
 
 
-class JogBody(_Strict):
-    """``POST /jog``: a heartbeat.
-
-    The first one has no ``id``; those that follow have the one that it was answered. With a ``sequence``,
-    which rises from heartbeat to heartbeat, one that was held up on its way is not taken.
-    """
-
-    pan_rad_per_s: Rate
-    tilt_rad_per_s: Rate
-    id: Name | None = None
-    sequence: Annotated[int, Field(ge=0, le=2**53)] | None = None
-
-    def beat(self) -> Beat:
-        """Return it as the jog takes it."""
-        return Beat((self.pan_rad_per_s, self.tilt_rad_per_s), self.sequence, self.id)
-
-
-class SunBody(_Strict):
+class SunBody(StrictBody):
     """``POST /limits/sun``: a direction by azimuth and elevation, or as a vector, and the cone around it.
 
     Azimuth goes from x over y, elevation up; in the site frame x is north and y east, in the rover's forward
@@ -311,7 +180,7 @@ class SunBody(_Strict):
         return self
 
     def sun(self, now_s: float) -> SunDirection:
-        """Return it as the door takes it."""
+        """Return it as the judge of moves takes it."""
         if self.direction is None:
             assert self.azimuth_rad is not None and self.elevation_rad is not None
             x, y, z = direction_of(self.azimuth_rad, self.elevation_rad)
@@ -321,7 +190,7 @@ class SunBody(_Strict):
         return SunDirection((x, y, z), self.frame, self.half_angle_rad, until_s)
 
 
-class StandBody(_Strict):
+class StandBody(StrictBody):
     """``POST /simulation/pose``: where the simulated rover truly stands on its ground."""
 
     x_m: Metres
@@ -331,7 +200,7 @@ class StandBody(_Strict):
     roll_rad: Slope = 0.0
 
 
-class BoardBody(_Strict):
+class BoardBody(StrictBody):
     """``POST /simulation/boards/{name}``: where a board is held up before a simulated rover.
 
     ``board`` holds what a BOARD.yaml does (its ``schema`` may be left out); without it a board of this name
@@ -362,13 +231,13 @@ class BoardBody(_Strict):
         return rotation_of(self.quaternion)
 
 
-class TimeBody(_Strict):
+class TimeBody(StrictBody):
     """``POST /simulation/time``: let time pass where it does not pass by itself."""
 
     advance_s: Annotated[float, Field(ge=0.0, le=3600.0)]
 
 
-class MastBody(_Strict):
+class MastBody(StrictBody):
     """``POST /mast``: the name of a file beside the configured mast file, or ``previous``: true."""
 
     file: Name | None = None
@@ -381,14 +250,14 @@ class MastBody(_Strict):
         return self
 
 
-class PlaceBody(_Strict):
+class PlaceBody(StrictBody):
     """``POST /places/{name}``: the angles that are kept, as the head reads them."""
 
     pan_rad: Angle
     tilt_rad: Angle
 
 
-class BenchBody(_Strict):
+class BenchBody(StrictBody):
     """``POST /bench``: with which board, and how far; or with which run to go on.
 
     ``board`` names a packaged one, ``board_file`` is the text of a BOARD.yaml. ``wanted_px`` is what the
@@ -411,7 +280,7 @@ class BenchBody(_Strict):
         return self
 
 
-class FaultBody(_Strict):
+class FaultBody(StrictBody):
     """``POST /simulation/faults``: a fault word for a simulated device, with its parameters."""
 
     device: Name

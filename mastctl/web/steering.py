@@ -27,7 +27,6 @@ from mastctl.answers import (
     SunTold,
     TrackTold,
 )
-from mastctl.as_json import as_json
 from mastctl.control.caller import client_name
 from mastctl.control.entry import (
     ESTOP,
@@ -49,26 +48,25 @@ from mastctl.control.entry import (
     CommandRequest,
 )
 from mastctl.control.lease import Lease, LeaseTable
+from mastctl.control.standing import Latched
 from mastctl.errors import BadRequest, NotNow, Unable, one_line
 from mastctl.http import PREFIX
+from mastctl.motion.jog import JogBeat
+from mastctl.motion.requests import PointRequest, TrackRequest
 from mastctl.motion.results import PointingError
 from mastctl.safety.latch import LONGEST
 from mastctl.safety.stop_threads import StopsHang
 from mastctl.service.service import Service
 from mastctl.service.steering import usual_s
-from mastctl.web.commands import Asks, caller_of, carried_out, command, stop_first
+from mastctl.web.commands import Asks, carried_out, command, stop_first
 from mastctl.web.models import (
     EstopBody,
-    JogBody,
     LeaseBody,
-    PointBody,
     PoseBody,
-    PreviewBody,
     RenewBody,
     ResetBody,
     SunBody,
     TakeBody,
-    TrackBody,
 )
 from mastctl.web.parts import Here, Parts
 
@@ -92,18 +90,19 @@ def add_pointing(app: FastAPI) -> None:
         status_code=202,
         usual_s=lambda here, body: usual_s(here.service.config.limits, body.looks),
     )
-    def point(body: PointBody, here: Here) -> Started:
-        told = body.model_dump(exclude_none=True)
-        return {"id": here.service.steering.point(body.request, told).id}
+    def point(body: PointRequest, here: Here) -> Started:
+        return {"id": here.service.steering.point(body, body.model_dump(exclude_none=True)).id}
 
     @app.post(f"{PREFIX}/point/preview", summary="The point at a pixel, before anything moves")
-    async def preview(body: PreviewBody, here: Here) -> PreviewTold:
+    async def preview(body: PointRequest, here: Here) -> PreviewTold:
         service = here.service
+        if body.pixel is None:
+            raise BadRequest("bad_request", "pixel is missing; a preview is of a pixel of a named frame")
         service.check_camera(body.pixel.camera)
         cancelled = threading.Event()
         try:
             seen: PreviewTold = await here.waiting.image(
-                body.pixel.camera, lambda: as_json(service.steering.preview(body.request, cancelled))
+                body.pixel.camera, lambda: service.steering.preview(body, cancelled)
             )
         except PointingError as error:
             kind = NotNow if error.code in ("head_moving", "stopped") else BadRequest
@@ -118,7 +117,7 @@ def add_pointing(app: FastAPI) -> None:
 
     @app.get(f"{PREFIX}/operations/{{operation_id}}", summary="One operation's record")
     async def operation(operation_id: str, here: Here) -> OperationTold:
-        return here.service.operations.get(operation_id).told()
+        return here.service.operations.get(operation_id).as_json()
 
     @app.post(
         f"{PREFIX}/operations/{{operation_id}}/stop",
@@ -130,11 +129,11 @@ def add_pointing(app: FastAPI) -> None:
             return {}
 
         await carried_out(here, request, OPERATION_STOP, asked, {}, act, beside=True)
-        return here.service.operations.get(operation_id).told()
+        return here.service.operations.get(operation_id).as_json()
 
     @app.post(f"{PREFIX}/stop", summary="Stop the mast and the running operation, at once")
     async def stop(request: Request, here: Here) -> StopTold:
-        return await stop_first(here, STOP, request, here.service.stopping.stop_told)
+        return await stop_first(here, STOP, request, here.service.stopping.stop_answer)
 
 
 def add_estop(app: FastAPI) -> None:
@@ -146,26 +145,26 @@ def add_estop(app: FastAPI) -> None:
         openapi_extra={"requestBody": {"content": {"application/json": {"schema": ANY_BODY}}}},
     )
     async def estop(request: Request, here: Here) -> EstopTold:
-        stopping, entry = here.service.stopping, here.service.entry
+        stopping = here.service.stopping
         reading = asyncio.ensure_future(_reason_and_name(request))
         await asyncio.wait([reading], timeout=0)  # one turn of the loop: what came with the request is read
-        late = not reading.done()
-        given = {"reason": None, "name": None} if late else reading.result()
-        stop = partial(stopping.estop, **given, reason_follows=late)
+        follows = not reading.done()
+        given = {"reason": None, "name": None} if follows else reading.result()
+        stop = partial(stopping.estop, **given, reason_follows=follows)
+        cause: Latched | None = None
+
+        async def late() -> dict[str, str | None]:
+            nonlocal cause, given
+            given = await reading
+            cause = stopping.explain_estop(**given)
+            return given
+
         try:
-            answer = await stop_first(here, ESTOP, request, stop, given)
+            answer = await stop_first(here, ESTOP, request, stop, given, late if follows else None)
         except StopsHang as error:
             await here.waiting.run(lambda: stopping.latch_estop(**given))
             raise Unable("stop_unconfirmed", f"the emergency stop is latched, but {error}") from None
-        finally:
-            if late:
-                given = await reading
-                cause = stopping.explain_estop(**given)
-                if any(given.values()):
-                    entry.note(ESTOP, CommandRequest(caller_of(request), request=given))
-        if late and cause is not None:
-            answer |= {"reason": cause.reason, "name": cause.name}
-        return answer
+        return answer if cause is None else {**answer, "reason": cause.reason, "name": cause.name}
 
     @command(app, "POST /reset", RESET, "Release an emergency stop; nothing moves before the next command")
     def reset(body: ResetBody, here: Here) -> ResetTold:
@@ -205,13 +204,13 @@ def add_tracking(app: FastAPI) -> None:
         usual_s=one_look_s,
     )
     def pose(body: PoseBody, here: Here, asked: Asks) -> PoseTaken:
-        operation = here.service.steering.take_pose(body.pose(asked.asked_s), body.look)
+        operation = here.service.steering.take_pose(body.pose(asked.came_s), body.look)
         stop_before_keep_outs(here.service)  # a sun of the site frame turns with the rover
-        return {"operation": operation, "track": here.service.track_told()}
+        return {"operation": operation, "track": here.service.track_answer()}
 
     @app.get(f"{PREFIX}/track", summary="The track at this moment")
     async def track(here: Here) -> TrackTold:
-        return here.service.track_told()
+        return here.service.track_answer()
 
     @command(
         app,
@@ -221,9 +220,9 @@ def add_tracking(app: FastAPI) -> None:
         status_code=202,
         usual_s=one_look_s,
     )
-    def start(body: TrackBody, here: Here) -> Started:
-        told = {"track": body.model_dump(exclude_none=True)}
-        return {"id": here.service.steering.start_track(body.target(), told).id}
+    def start(body: TrackRequest, here: Here) -> Started:
+        recorded = {"track": body.model_dump(exclude_none=True)}
+        return {"id": here.service.steering.start_track(body, recorded).id}
 
     @command(
         app,
@@ -243,39 +242,37 @@ def add_tracking(app: FastAPI) -> None:
             return {}
 
         await carried_out(here, request, TRACK_STOP, asked, {}, act, beside=True)
-        return here.service.track_told()
+        return here.service.track_answer()
 
 
 def add_limits(app: FastAPI) -> None:
     """The jog, and the sun."""
 
-    @app.post(f"{PREFIX}/jog", summary="A heartbeat: turn the head at a rate, for half a second")
-    async def jog(body: JogBody, asked: Asks, here: Here, request: Request) -> JogTold:
-        told, beat, jogs = body.model_dump(exclude_none=True), body.beat(), here.service.jogs
-        with jogs.heard(beat) as may_begin:  # from its arrival on
-            return await carried_out(here, request, JOG, asked, told, lambda: jogs.beat(beat, may_begin))
+    @command(app, "POST /jog", JOG, "A heartbeat: turn the head at a rate, for half a second")
+    def jog(body: JogBeat, here: Here) -> JogTold:
+        return here.service.jogs.beat(body)
 
     @app.get(f"{PREFIX}/limits/sun", summary="The direction that no head camera looks into")
     async def sun(here: Here) -> SunTold:
-        return here.service.devices.door.told()
+        return here.service.devices.judge.sun_as_json()
 
     @command(app, "POST /limits/sun", SUN, "Say where the sun stands; the head keeps off it")
     def tell(body: SunBody, here: Here, asked: Asks) -> SunTold:
-        door = here.service.devices.door
-        door.use_sun(body.sun(asked.asked_s))
+        judge = here.service.devices.judge
+        judge.use_sun(body.sun(asked.came_s))
         stop_before_keep_outs(here.service)
-        return door.told()
+        return judge.sun_as_json()
 
     @command(app, "DELETE /limits/sun", SUN_FORGET, "Keep the head off no sun any more")
     def forget(here: Here) -> SunTold:
-        door = here.service.devices.door
-        door.use_sun(None)
-        return door.told()
+        judge = here.service.devices.judge
+        judge.use_sun(None)
+        return judge.sun_as_json()
 
 
 def stop_before_keep_outs(service: Service) -> None:
     """Stop a head that is under way into what has come to be kept out. Raises DriverError."""
-    name = service.devices.door.in_the_way(service.devices.last_reading)
+    name = service.devices.judge.in_the_way(service.devices.last_reading)
     if name is not None:
         service.operations.stop(f"the keep-out {name} came to lie in the head's way")
 
@@ -285,7 +282,7 @@ def add_lease(app: FastAPI) -> None:
 
     @app.get(f"{PREFIX}/lease", summary="Who steers")
     async def control(here: Here) -> LeaseTold:
-        return {"control": here.service.leases.told()}
+        return {"control": here.service.leases.as_json()}
 
     @command(app, "POST /lease", LEASE, "Acquire the lease, if no other client steers")
     def acquire(body: LeaseBody, here: Here, asked: Asks) -> LeaseGranted:
@@ -309,7 +306,7 @@ def add_lease(app: FastAPI) -> None:
     def release(here: Here, asked: Asks) -> LeaseTold:
         leases = here.service.leases
         leases.release(_lease_of(asked))
-        return {"control": leases.told()}
+        return {"control": leases.as_json()}
 
     @command(
         app, "POST /lease/take", LEASE_TAKE, "Take the lease from its holder; what runs under it is stopped"
@@ -326,7 +323,7 @@ def _terms(body: LeaseBody) -> dict[str, Any]:
 
 
 def _granted(leases: LeaseTable, lease: Lease) -> LeaseGranted:
-    return {"lease_id": lease.id, **leases.told_of(lease)}
+    return {"lease_id": lease.id, **leases.lease_as_json(lease)}
 
 
 def _which(asked: CommandRequest) -> dict[str, str]:

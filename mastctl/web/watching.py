@@ -44,9 +44,9 @@ def add_watching(app: FastAPI) -> None:
     async def ready(request: Request, here: Here) -> ReadyTold:
         now = here.service.machine.standing
         reason = "" if caller_of(request).stranger else now.reason  # it may name a person
-        if now.word not in WELL:
-            raise Unable("not_ready", f"{now.word}: {reason}" if reason else now.word)
-        return {"ready": True, "state": now.word, "reason": reason}
+        if now.state not in WELL:
+            raise Unable("not_ready", f"{now.state}: {reason}" if reason else now.state)
+        return {"ready": True, "state": now.state, "reason": reason}
 
     @app.get(
         f"{PREFIX}/calibration/health",

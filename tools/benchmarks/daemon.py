@@ -33,7 +33,7 @@ from hil_tests.support.living_daemon import simulated, started
 from mastctl.cli.options import at_least
 from mastctl.client import Client, ClientError
 from mastctl.packaged import default_config
-from mastctl.safety.stop_line import ask
+from mastctl.safety.stop_line import request
 from tools.command import end, heading, line, options
 
 HEADS = ("memory", "dynamixel", "ptu")
@@ -127,9 +127,9 @@ def _requests(url: str, path: Path) -> dict[str, Callable[[], Any]]:
 
     return {
         "stop, HTTP": lambda: once(lambda client: client.stop()),
-        "stop, socket": lambda: ask(path, "stop"),
+        "stop, socket": lambda: request(path, "stop"),
         "estop, HTTP": lambda: once(lambda client: client.estop()),
-        "estop, socket": lambda: ask(path, "estop benchmark: a measurement"),
+        "estop, socket": lambda: request(path, "estop benchmark: a measurement"),
     }
 
 

@@ -88,7 +88,7 @@ def far_look(url: str, act: Callable[[Client], object]) -> str:
 
 def test_a_stop_and_an_emergency_stop_are_told_apart(url: str) -> None:
     assert far_look(url, lambda ana: ana.stop()) == (
-        "the head was stopped in the middle of a move: a stop was asked for"
+        "the head was stopped in the middle of a move: a stop was requested"
     )
     told = far_look(url, lambda ana: ana.estop(reason="a hand in the way", name="Ana"))
     assert "an emergency stop: a hand in the way (Ana)" in told and "'mastctl reset' releases it" in told

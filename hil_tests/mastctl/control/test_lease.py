@@ -12,7 +12,7 @@ from drivers.errors import NoReply
 from hil_tests.waiting import joined, until
 from mastctl.control import lease as lease_module
 from mastctl.control.caller import Caller
-from mastctl.control.lease import LONGEST_S, SHORTEST_S, Lease, Leased, LeaseTable, WhoSteers
+from mastctl.control.lease import LONGEST_S, SHORTEST_S, Lease, Leased, LeaseTable, Steerer
 from mastctl.errors import BadRequest, MastctlError, NotNow
 
 BENCH = Caller("bench")
@@ -25,7 +25,7 @@ class World:
     def __init__(self) -> None:
         self.clock = ManualClock(100.0)
         self.runs = False
-        self.changes: list[WhoSteers | None] = []
+        self.changes: list[Steerer | None] = []
         self.stops: list[str] = []
         self.leases = LeaseTable(self.clock, lambda: self.runs, self.changes.append, self.stop)
 
@@ -127,8 +127,8 @@ def test_who_takes_over_steers_and_the_former_holder_hears_by_whom_and_why(world
 
 def test_without_a_lease_the_client_that_starts_something_steers(world: World) -> None:
     world.steer(BENCH, starts=True)
-    assert world.leases.control() == WhoSteers("bench", "operation")
-    assert world.leases.told() == {"holder": "bench", "kind": "operation", "for_s": None, "until": None}
+    assert world.leases.control() == Steerer("bench", "operation")
+    assert world.leases.as_json() == {"holder": "bench", "kind": "operation", "for_s": None, "until": None}
     refused("leased", lambda: world.steer(ROVER))
     refused("leased", lambda: world.leases.acquire(ROVER))
     world.steer(BENCH)
@@ -154,7 +154,7 @@ def test_what_a_holder_started_is_its_own_until_it_is_stopped(world: World) -> N
     lease = world.leases.acquire(BENCH, for_s=5.0)
     world.steer(BENCH, lease, starts=True)
     world.clock.advance(6.0)
-    assert world.leases.control() == WhoSteers("bench", "operation")
+    assert world.leases.control() == Steerer("bench", "operation")
     refused("leased", lambda: world.leases.acquire(ROVER))
     world.leases.stop_left_running()
     assert world.leases.control() is None
@@ -173,7 +173,7 @@ def test_a_time_out_of_bounds_is_refused_and_changes_nothing(world: World, for_s
     lease = world.leases.acquire(BENCH)
     refused("bad_request", lambda: world.leases.renew(lease.id, for_s))
     refused("bad_request", lambda: world.leases.take(ROVER, "why not", for_s=for_s))
-    assert world.leases.control() == WhoSteers("bench", "lease", lease.until_s)
+    assert world.leases.control() == Steerer("bench", "lease", lease.until_s)
     with pytest.raises(BadRequest):
         world.leases.take(ROVER, "why not", for_s=for_s)
 
@@ -308,7 +308,7 @@ def test_a_lease_that_is_taken_is_none_if_the_head_did_not_stop(world: World) ->
         pass
     with pytest.raises(NoReply):
         leases.take(BENCH, "it hangs")
-    assert leases.control() == WhoSteers("rover", "operation")
+    assert leases.control() == Steerer("rover", "operation")
 
 
 def test_a_refused_command_does_not_make_its_client_the_owner_of_what_runs(world: World) -> None:

@@ -13,7 +13,6 @@ from mastctl.answers import Word
 from mastctl.control.machine import StateMachine
 from mastctl.control.publisher import Publisher, Topic
 from mastctl.control.standing import Latched, Residual, Standing, StandingFault
-from mastctl.control.table import leads_to
 from mastctl.errors import MastctlError, NotNow, Unable
 
 LATCH = Latched("Ana", "a hand in the way", "2026-01-02T03:04:05Z")
@@ -35,13 +34,17 @@ class Heard(Publisher):
 
 
 def stopped_head(machine: StateMachine) -> None:
-    machine.stop_asked()
+    machine.stop_requested()
     machine.stop_ended()
 
 
+def estop_requested(machine: StateMachine) -> None:
+    machine.stop_requested()
+    machine.estop_requested(lambda: (LATCH,))
+
+
 def latched(machine: StateMachine) -> None:
-    machine.stop_asked()
-    machine.estop_asked(lambda: (LATCH,))
+    estop_requested(machine)
     machine.stop_ended()
 
 
@@ -55,11 +58,11 @@ def asked_reset(machine: StateMachine, name: str) -> None:
 # The way into each state, by what is told on it alone.
 INTO: dict[Word, Callable[[StateMachine], Any]] = {
     "starting": lambda machine: None,
-    "ready": lambda machine: machine.head_read(False),
+    "ready": lambda machine: None,
     "moving": lambda machine: machine.operation_began("1", {}),
     "tracking": lambda machine: machine.track_began("1"),
     "holding": stopped_head,
-    "stopping": lambda machine: machine.stop_asked(),
+    "stopping": lambda machine: machine.stop_requested(),
     "stopped": latched,
     "fault": lambda machine: machine.head_faults((SILENT,)),
     "closing": lambda machine: machine.closing(),
@@ -71,9 +74,9 @@ TELL: dict[str, Callable[[StateMachine], Any]] = {
     "head_rests": lambda machine: machine.head_read(False),
     "track_began": lambda machine: machine.track_began("2"),
     "track_ended": lambda machine: machine.track_ended("1"),
-    "stop_asked": lambda machine: machine.stop_asked(),
+    "stop_requested": lambda machine: machine.stop_requested(),
     "stop_ended": lambda machine: machine.stop_ended(),
-    "estop_asked": lambda machine: machine.estop_asked(lambda: (LATCH,)),
+    "estop_requested": estop_requested,
     "reset": lambda machine: asked_reset(machine, "Ana"),
     "fault_stands": lambda machine: machine.head_faults((HOT,)),
     "fault_cleared": lambda machine: machine.head_faults(()),
@@ -100,15 +103,17 @@ PAIRS = [(row[0], event, must) for row in ROWS for event, must in zip(TELL, row[
 def machine_in(word: Word) -> tuple[StateMachine, Heard, ManualClock]:
     clock, heard = ManualClock(10.0), Heard()
     machine = StateMachine(clock, heard)
+    if word != "starting":
+        machine.head_read(False)
     INTO[word](machine)
-    assert machine.standing.word == word
+    assert machine.standing.state == word
     return machine, heard, clock
 
 
 @pytest.mark.parametrize(("word", "event", "must"), PAIRS)
 def test_every_event_in_every_state_does_what_the_states_mean(word: Word, event: str, must: str) -> None:
     machine, heard, clock = machine_in(word)
-    before = machine.standing
+    before, published = machine.standing, len(heard.standings)
     clock.advance(5.0)
     if must.startswith("!"):
         with pytest.raises(MastctlError) as refused:
@@ -118,40 +123,40 @@ def test_every_event_in_every_state_does_what_the_states_mean(word: Word, event:
         return
     TELL[event](machine)
     now = machine.standing
-    assert now.word == must
-    assert now.word in leads_to(word, event)  # type: ignore[arg-type]
-    assert now.since_s == (before.since_s if now.word == word else 15.0)
-    assert now.reason or now.word == "ready"
+    assert now.state == must
+    assert now.since_s == (before.since_s if now.state == word else 15.0)
+    assert now.reason or now.state == "ready"
     assert heard.standings[-1] is now
-    assert now.sequence == before.sequence + (now is not before)
+    changes = len(heard.standings) - published
+    assert now.sequence == before.sequence + changes and changes <= (2 if event == "estop_requested" else 1)
 
 
 def test_a_stop_is_over_when_all_are_confirmed_and_nothing_runs() -> None:
     machine, _, _ = machine_in("moving")
-    machine.stop_asked()
-    machine.stop_asked()
+    machine.stop_requested()
+    machine.stop_requested()
     machine.stop_ended()
-    assert machine.standing.word == "stopping" and "is being stopped" in machine.standing.reason
+    assert machine.standing.state == "stopping" and "is being stopped" in machine.standing.reason
     machine.stop_ended()
-    assert (machine.standing.word, machine.standing.reason) == ("stopping", "operation 1 is being stopped")
+    assert (machine.standing.state, machine.standing.reason) == ("stopping", "operation 1 is being stopped")
     machine.operation_ended("1")
-    assert machine.standing.word == "holding" and "next command starts" in machine.standing.reason
+    assert machine.standing.state == "holding" and "next command starts" in machine.standing.reason
 
 
 def test_an_unconfirmed_stop_ends_in_a_fault_or_latched() -> None:
     machine, _, _ = machine_in("ready")
-    machine.stop_asked()
+    machine.stop_requested()
     machine.head_faults((SILENT,))
     machine.stop_ended()
-    assert machine.standing.word == "fault"
+    assert machine.standing.state == "fault"
     assert machine.standing.reason == "the head is silent, until it answers"
     latched(machine)
-    assert machine.standing.word == "stopped"
+    assert machine.standing.state == "stopped"
     assert "Ana: a hand in the way" in machine.standing.reason and "silent" in machine.standing.reason
     machine.reset("Ben", "nobody there")
-    assert machine.standing.word == "fault" and machine.standing.latched == ()
+    assert machine.standing.state == "fault" and machine.standing.latched == ()
     machine.head_faults(())
-    assert machine.standing.word == "holding"
+    assert machine.standing.state == "holding"
     assert "Ben: nobody there" in machine.standing.reason
 
 
@@ -162,20 +167,20 @@ def test_a_fault_that_is_over_leaves_a_head_that_holds_and_says_so() -> None:
     machine.head_faults((HOT,))
     assert machine.standing.reason == "the tilt motor is hot, until it has cooled"
     machine.head_faults(())
-    assert machine.standing.word == "holding"
+    assert machine.standing.state == "holding"
     assert machine.standing.reason == "it is over: the tilt motor is hot; the next command starts"
     machine.operation_began("1", {})
     machine.operation_ended("1")
-    assert machine.standing.word == "ready"
+    assert machine.standing.state == "ready"
 
 
 def test_an_operation_that_lives_through_a_fault_goes_on() -> None:
     machine, _, _ = machine_in("moving")
     machine.head_faults((SILENT,))
     machine.head_faults(())
-    assert machine.standing.word == "moving"
+    assert machine.standing.state == "moving"
     machine.operation_ended("1")
-    assert machine.standing.word == "ready"
+    assert machine.standing.state == "ready"
 
 
 def test_a_fault_whose_words_only_grow_older_is_told_once() -> None:
@@ -192,20 +197,20 @@ def test_a_fault_whose_words_only_grow_older_is_told_once() -> None:
 def test_a_head_that_is_moved_while_it_holds_holds_again_afterwards() -> None:
     machine, _, _ = machine_in("holding")
     machine.head_read(True)
-    assert machine.standing.word == "moving"
+    assert machine.standing.state == "moving"
     machine.head_read(False)
-    assert machine.standing.word == "holding"
+    assert machine.standing.state == "holding"
 
 
 def test_a_head_that_still_runs_out_after_a_confirmed_stop_holds() -> None:
     machine, _, _ = machine_in("moving")
     machine.head_read(True)
-    machine.stop_asked()
+    machine.stop_requested()
     machine.operation_ended("1")
     machine.stop_ended()
-    assert machine.standing.word == "holding" and machine.standing.head_moves
+    assert machine.standing.state == "holding" and machine.standing.head_moves
     machine.head_read(False)
-    assert machine.standing.word == "holding"
+    assert machine.standing.state == "holding"
 
 
 def test_an_operation_beside_a_track_leaves_the_track_active() -> None:
@@ -216,7 +221,7 @@ def test_an_operation_beside_a_track_leaves_the_track_active() -> None:
     residual = Residual((0.1, 0.2), (0.1, 0.1), "9")
     machine.operation_ended("9", residual)
     now = machine.standing
-    assert (now.word, now.track, now.operation, now.residual) == ("tracking", "1", None, residual)
+    assert (now.state, now.track, now.operation, now.residual) == ("tracking", "1", None, residual)
     assert now.target == {"pan_rad": 0.1}
 
 
@@ -225,20 +230,20 @@ def test_what_ended_before_ends_nothing_that_runs_now() -> None:
     count = len(heard.standings)
     machine.operation_ended("0")
     machine.track_ended("0")
-    assert machine.standing.word == "moving" and len(heard.standings) == count
+    assert machine.standing.state == "moving" and len(heard.standings) == count
 
 
 def test_a_latch_from_before_the_start_blocks_at_once() -> None:
     machine = StateMachine(ManualClock(), latched=(LATCH,))
-    assert machine.standing.word == "stopped"
+    assert machine.standing.state == "stopped"
     machine.head_read(False)
-    assert machine.standing.word == "stopped"
-    machine.stop_asked()
-    machine.estop_asked(lambda: (LATCH, Latched("Ben", "again", "")))
+    assert machine.standing.state == "stopped"
+    machine.stop_requested()
+    machine.estop_requested(lambda: (LATCH, Latched("Ben", "again", "")))
     machine.stop_ended()
     assert machine.standing.latched[0] == LATCH and len(machine.standing.latched) == 2
     machine.reset("Ben", "checked")
-    assert (machine.standing.word, machine.standing.reason) == (
+    assert (machine.standing.state, machine.standing.reason) == (
         "holding",
         "reset by Ben: checked; the next command starts",
     )

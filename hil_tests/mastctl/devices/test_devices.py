@@ -303,8 +303,8 @@ def test_a_stop_reaches_a_head_that_only_fails_to_read(devices: Devices, hardwar
 
 
 def test_blocked_moves_are_refused_until_they_are_allowed(devices: Devices, hardware: FakeHardware) -> None:
-    devices.block_moves("stop", "a stop was asked for")
-    with pytest.raises(Stopped, match="a stop was asked for"):
+    devices.block_moves("stop", "a stop was requested")
+    with pytest.raises(Stopped, match="a stop was requested"):
         devices.move(0.1, 0.1)
     devices.allow_moves("stop")
     devices.move(0.1, 0.1)
@@ -416,7 +416,7 @@ BAD_FRAMES: list[tuple[str, Change, type[DriverError], str]] = [
         "begun before",
         lambda f: replace(f, mid_exposure_s=f.mid_exposure_s - 0.0015),
         NoFreshFrame,
-        "before the asked moment",
+        "before the requested moment",
     ),
     ("none", lambda f: None, BadFrame, "not a frame"),
     ("float image", lambda f: replace(f, image=f.image.astype(float)), BadFrame, "float64"),

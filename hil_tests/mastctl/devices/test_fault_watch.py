@@ -24,7 +24,7 @@ def devices(hardware: FakeHardware, machine: StateMachine, clock: Turned) -> Ite
     limits = Limits((-2.0, 2.0), (-1.0, 1.0), 0.5)
     made = Devices(hardware, limits, "0" * 64, clock, rig(), machine=machine)
     with clock.at_work():
-        clock.until(lambda: machine.standing.word == "ready", "a first reading")
+        clock.until(lambda: machine.standing.state == "ready", "a first reading")
         yield made
     hardware.head.hook = lambda name: None
     made.close()
@@ -36,12 +36,12 @@ def test_a_head_that_hangs_is_a_fault_although_nobody_asks(
     hang = Hang(clock)
     with machine.publisher.subscribe("fault", known=False) as heard:
         hardware.head.hook = lambda name: hang() if name == "read" else None
-        clock.until(lambda: machine.standing.word == "fault", "the fault")
+        clock.until(lambda: machine.standing.state == "fault", "the fault")
         assert "does not answer: read has been under way" in machine.standing.reason
         assert machine.standing.reason.endswith("until the head is read again")
         hardware.head.hook = lambda name: None
         hang.let_go()
-        clock.until(lambda: machine.standing.word == "holding", "the end of the fault")
+        clock.until(lambda: machine.standing.state == "holding", "the end of the fault")
         assert machine.standing.reason.startswith("it is over: ")
         told = heard.wait(0)
         assert [(one.key, one.value) for one in told] == [(HEAD, ())] and heard.lost <= 3
@@ -51,7 +51,7 @@ def test_what_the_head_reports_is_one_fault_as_long_as_it_lasts(
     devices: Devices, hardware: FakeHardware, machine: StateMachine, clock: Turned
 ) -> None:
     hardware.head.faults = ("tilt motor is hot",)
-    clock.until(lambda: machine.standing.word == "fault", "the fault")
+    clock.until(lambda: machine.standing.state == "fault", "the fault")
     began = machine.standing
     for _ in range(5):
         devices.read()
@@ -59,7 +59,7 @@ def test_what_the_head_reports_is_one_fault_as_long_as_it_lasts(
     assert fault == began.faults[0], "since it began, not since the last reading"
     assert machine.standing is began
     hardware.head.faults = ()
-    clock.until(lambda: machine.standing.word == "holding", "the end of the fault")
+    clock.until(lambda: machine.standing.state == "holding", "the end of the fault")
 
 
 def test_a_stop_that_is_not_confirmed_is_told_before_it_is_over(
@@ -70,15 +70,15 @@ def test_a_stop_that_is_not_confirmed_is_told_before_it_is_over(
             raise NoReply("no answer", device=HEAD)
 
     hardware.head.hook = refuse
-    machine.stop_asked()
+    machine.stop_requested()
     with pytest.raises(NoReply):
         devices.stop()
-    assert machine.standing.word == "stopping" and machine.standing.faults
+    assert machine.standing.state == "stopping" and machine.standing.faults
     machine.stop_ended()
-    assert machine.standing.word == "fault" and "may still move" in machine.standing.reason
+    assert machine.standing.state == "fault" and "may still move" in machine.standing.reason
     hardware.head.hook = lambda name: None
     devices.stop()
-    assert machine.standing.word == "holding"
+    assert machine.standing.state == "holding"
 
 
 def test_a_fault_of_a_camera_is_published_and_changes_no_state(
@@ -99,4 +99,4 @@ def test_a_fault_of_a_camera_is_published_and_changes_no_state(
         (facts,) = [one for one in clock.until(lambda: heard.wait(0), "the facts") if one.topic == "frame"]
         assert facts.value.frame_id == frame.frame_id and not hasattr(facts.value, "image")
         clock.until(lambda: machine.publisher.newest("fault", "navcam_left") == (), "its end")
-    assert machine.standing.word == "ready"
+    assert machine.standing.state == "ready"

@@ -53,7 +53,7 @@ def test_of_however_many_frames_a_camera_has_a_fixed_number_stays() -> None:
     for number in range(2000):
         one = replace(frame(number, FRAME), mast_digest=DIGEST)
         alive.add(one)
-        store.add(one, told=number % 3 == 0)
+        store.add(one, number % 3 == 0)
         if number % 40 == 0:
             store.hold(one, OPERATIONS, 8)
         del one

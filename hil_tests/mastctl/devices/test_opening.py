@@ -93,7 +93,7 @@ class Watched:
         assert place is not None
         latch = Latch(place)
         latch.hold("sparks", "Ana")
-        latch.head_told()
+        latch.head_stopped()
         assert latch.kept_within(60.0)
         latch.close()
         place.close()

@@ -17,7 +17,7 @@ from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from hil_tests.waiting import NET_S, until
 from mastctl.devices import devices as devices_module
 from mastctl.devices.devices import Devices
-from mastctl.devices.stops import room_s
+from mastctl.devices.stops import next_try_s
 from mastctl.errors import MastctlError, Stopped
 
 DEADLINE_S = 1.0
@@ -72,14 +72,14 @@ def test_no_move_goes_out_while_an_old_stop_is_inside_the_driver(
     clock.until(lambda: hardware.head.calls == [("stop",)], "the stop in turn")
     devices.read()
     with pytest.raises(
-        Stopped, match=r"a stop asked for \d+\.\d s ago has not come back from the driver yet"
+        Stopped, match=r"a stop requested \d+\.\d s ago has not come back from the driver yet"
     ):
         devices.move(0.5, 0.5)
     clock.until(lambda: "the head may still move" in one_fault(devices).message, "the first one overdue")
     with caplog.at_level(logging.WARNING):
         stops.let_go()
         clock.until(lambda: "ended only now" in one_fault(devices).message, "the late stop told")
-    assert "a stop asked for" in caplog.text and "ended only now" in caplog.text
+    assert "a stop requested" in caplog.text and "ended only now" in caplog.text
     devices.move(0.5, 0.5)
     assert hardware.head.calls[-1][:3] == ("move", 0.5, 0.5), "no old stop ends the new move"
     clock.until(lambda: devices.faults() == (), "the head at rest after a move")
@@ -148,7 +148,7 @@ def test_stops_repeated_into_a_hanging_driver_pile_up_no_threads(
     began_s: list[float] = []
     while at_s <= begun_s + hung_s:
         began_s.append(at_s)
-        most, at_s = most + 1, room_s(began_s, 0.06)
+        most, at_s = most + 1, next_try_s(began_s, 0.06)
     assert 1 <= beside <= most < 40
     hangs.let_go()
     clock.until(lambda: not any(t.name == "stop beside" for t in threading.enumerate()), "all back")

@@ -53,7 +53,7 @@ class Bench:
         self.history = JointHistory(self.joints)
         self.devices = object.__new__(Devices)  # of it only `goal` is asked: no thread, no camera
         self.devices._joints = self.joints
-        self.devices.door = KeepOutJudge(LIMITS, self.head, self.clock, "head", None, None)
+        self.devices.judge = KeepOutJudge(LIMITS, self.head, self.clock, "head", None, None)
         self.here = self.history.add(self.head.read())
 
     def go(self, pan_rad: float, tilt_rad: float) -> HeadReading:
@@ -102,7 +102,7 @@ def test_a_goal_near_the_turnover_counts_the_side_of_approach(
 ) -> None:
     bench = Bench()
     hangs = AxisMotion(1.0, rising_below_rad=turnover_rad)
-    bench.devices.door._stated = {"pan": AxisMotion(1.0), "tilt": hangs}
+    bench.devices.judge._stated = {"pan": AxisMotion(1.0), "tilt": hangs}
     for past_rad in (-0.007, -0.003, 0.003, 0.007):  # from it, in readings: the true angle is 5 mrad away
         wanted_rad = TOLD.tilt.true_rad(turnover_rad + past_rad)
         assert abs(wanted_rad - turnover_rad - past_rad) > 0.003, "there is something to mistake"

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
 from functools import cache
 
 import numpy as np
@@ -169,7 +170,11 @@ class World:
         self._from = self._to = self.joints(self.clock.now_s())[0]
 
     def frames(
-        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float
+        self,
+        cameras: Sequence[str],
+        exposed_after_s: float,
+        timeout_s: float,
+        check: Callable[[], None] | None = None,
     ) -> dict[str, StampedFrame]:
         self.clock.advance(max(0.0, exposed_after_s - self.clock.now_s()) + 0.05)
         taken = {name: self._take(name) for name in cameras}
@@ -181,7 +186,10 @@ class World:
             raise NotKnown("frame_unknown", f"frame {frame_id} was not taken here")
         return self._frames[frame_id]
 
-    def check_from(self, here: Pair, goal: Pair) -> None:
+    def exposure_held(self) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    def check_from(self, start: Pair, goal: Pair) -> None:
         LIMITS.check(*goal)
 
     def newest_frames(self) -> dict[str, StampedFrame | None]:
@@ -236,14 +244,27 @@ def run(
 ) -> tuple[PointingResult, list[Step]]:
     """Run a request and return its result and steps."""
     steps: list[Step] = []
-    loop = PointingLoop(believed or rig(), world, LIMITS, world.clock, settings)
-    return loop.run(request, steps.append, cancelled or threading.Event()), steps
+    return loop_of(world, steps, believed, cancelled, settings).run(request), steps
+
+
+def loop_of(
+    world: World,
+    steps: list[Step],
+    believed: Rig | None = None,
+    cancelled: threading.Event | None = None,
+    settings: PointingSettings | None = None,
+    limits: Limits = LIMITS,
+) -> PointingLoop:
+    """A request's loop, whose steps come to a list."""
+    stopped = cancelled or threading.Event()
+    settings = settings or PointingSettings()
+    return PointingLoop(believed or rig(), world, limits, world.clock, settings, steps.append, stopped)
 
 
 def click(frame: StampedFrame, x_px: float, y_px: float, **more: object) -> PointRequest:
     """A request for a pixel of a frame."""
-    request = PointRequest(PixelTarget(frame.camera, frame.frame_id, x_px, y_px))
-    return replace(request, **more)  # type: ignore[arg-type]
+    pixel = PixelTarget(frame.camera, frame.frame_id, x_px, y_px)
+    return PointRequest(pixel=pixel, **more)  # type: ignore[arg-type]
 
 
 def moving_world(px_per_s: float, late_s: float = LATE_S) -> World:

@@ -22,7 +22,7 @@ from mastctl.devices.devices import Devices
 from mastctl.devices.keep_out import Box
 from mastctl.devices.limits import Limits
 from mastctl.errors import NotNow
-from mastctl.motion.jog import AHEAD_S, PATIENCE_S, TICK_S, Beat, Jogs
+from mastctl.motion.jog import AHEAD_S, PATIENCE_S, TICK_S, JogBeat, Jogs
 
 DECK = Box("deck", (-0.5, 0.5), (-1.2, -0.8))
 LIMITS = Limits((-1.0, 1.0), (-1.2, 0.6), 1.0, margin_rad=0.02, keep_out=(DECK,))
@@ -31,6 +31,11 @@ HEAD = PRESETS["dynamixel_x"]
 BRAKING_RAD = RATE**2 / 2 / HEAD.pan.acceleration_rad_per_s2
 AHEAD_RAD = RATE * AHEAD_S + BRAKING_RAD
 COUNT_RAD = HEAD.pan.count_rad
+
+
+def beat_of(pan: float, tilt: float, sequence: int = 1, name: str | None = None) -> JogBeat:
+    """A heartbeat; by default one that begins a jog."""
+    return JogBeat(pan_rad_per_s=pan, tilt_rad_per_s=tilt, sequence=sequence, id=name)
 
 
 @dataclass
@@ -71,15 +76,24 @@ class Rig:
     devices: Devices
     operations: OperationRunner
     jogs: Jogs
+    name: str | None = None
+    sent: int = 0
+
+    def beat(self, pan: float, tilt: float) -> Any:
+        """The next heartbeat of the jog, or the first; its answer."""
+        self.sent += 1
+        answer = self.jogs.beat(beat_of(pan, tilt, self.sent, self.name))
+        self.name = answer["id"]
+        return answer
 
     def pass_by(self, duration_s: float) -> None:
         self.clock.sleep(duration_s)
 
-    def beats(self, pan: float, tilt: float, for_s: float, **how: Any) -> Any:
+    def beats(self, pan: float, tilt: float, for_s: float) -> Any:
         """Heartbeats, one a tick; the last answer."""
         answer: Any = {}
         for _ in range(round(for_s / TICK_S)):
-            answer = self.jogs.beat(Beat((pan, tilt), **how))
+            answer = self.beat(pan, tilt)
             self.pass_by(TICK_S)
         return answer
 
@@ -145,11 +159,10 @@ def test_without_a_heartbeat_for_half_a_second_the_head_stops_and_says_why(rig: 
 
 def test_rates_of_zero_end_it_at_once(rig: Rig) -> None:
     name = rig.beats(RATE, 0.0, 0.5)["id"]
-    answer = rig.jogs.beat(Beat((0.0, 0.0), jog=name))
-    assert answer["taken"]
+    assert rig.beat(0.0, 0.0)["taken"]
     rig.pass_by(0.02)
     assert rig.ended(name).result.ended_because == "its client let go"
-    assert rig.jogs.beat(Beat((0.0, 0.0))) == {"id": None, "taken": False, "held": {}}
+    assert rig.jogs.beat(beat_of(0.0, 0.0)) == {"id": None, "taken": False, "held": {}}
 
 
 def test_a_heartbeat_of_a_jog_that_has_ended_moves_nothing(rig: Rig) -> None:
@@ -157,46 +170,49 @@ def test_a_heartbeat_of_a_jog_that_has_ended_moves_nothing(rig: Rig) -> None:
     rig.pass_by(1.0)
     moves = len(rig.head.moves)
     with pytest.raises(NotNow, match="does not run any more") as refused:
-        rig.jogs.beat(Beat((RATE, 0.0), jog=name))
+        rig.beat(RATE, 0.0)
+    assert refused.value.code == "jog_ended"
+    assert name not in (None, rig.operations.running)
+    with pytest.raises(NotNow, match="1 begins a jog") as refused:
+        rig.jogs.beat(beat_of(RATE, 0.0, 9))  # its client never learned the id
     assert refused.value.code == "jog_ended"
     rig.pass_by(0.5)
     assert len(rig.head.moves) == moves
 
 
 def test_heartbeats_out_of_order_are_not_taken_and_keep_nothing_going(rig: Rig) -> None:
-    name = rig.jogs.beat(Beat((RATE, 0.0), sequence=5))["id"]
+    name = rig.jogs.beat(beat_of(RATE, 0.0))["id"]
     rig.pass_by(0.2)
-    assert rig.jogs.beat(Beat((-RATE, 0.0), 7, name))["taken"]
+    assert rig.jogs.beat(beat_of(-RATE, 0.0, 7, name))["taken"]
     for number in (6, 7, 5):
         rig.pass_by(0.1)
-        assert not rig.jogs.beat(Beat((RATE, 0.0), number, name))["taken"]
-    assert not rig.jogs.beat(Beat((RATE, 0.0), None, name))["taken"]
+        assert not rig.jogs.beat(beat_of(RATE, 0.0, number, name))["taken"]
     rig.pass_by(0.35)
     assert rig.operations.get(name).state == "done"
     assert rig.head.moves[-1][1][0] < 0.0, "the newest one counted"
 
 
-def test_a_second_client_is_refused_while_the_first_counts_its_heartbeats(rig: Rig) -> None:
-    name = rig.jogs.beat(Beat((RATE, 0.0), sequence=1))["id"]
+def test_a_second_client_is_refused_while_the_first_jogs(rig: Rig) -> None:
+    name = rig.jogs.beat(beat_of(RATE, 0.0))["id"]
     with pytest.raises(NotNow, match="is running") as refused:
-        rig.jogs.beat(Beat((-RATE, 0.0), sequence=1))
+        rig.jogs.beat(beat_of(-RATE, 0.0))
     assert refused.value.code == "busy"
     with pytest.raises(NotNow) as refused:
-        rig.jogs.beat(Beat((-RATE, 0.0), 9, "000009-beef"))
+        rig.jogs.beat(beat_of(-RATE, 0.0, 9, "000009-beef"))
     assert refused.value.code == "jog_ended"
     rig.pass_by(0.2)
-    assert rig.jogs.beat(Beat((RATE, 0.0), 2, name))["taken"]
+    assert rig.jogs.beat(beat_of(RATE, 0.0, 2, name))["taken"]
 
 
 def test_a_jog_during_a_pointing_and_a_pointing_during_a_jog_are_refused(rig: Rig) -> None:
     go = threading.Event()
     pointing = rig.operations.start({}, lambda record, cancelled: go.wait(60.0)).id
     with pytest.raises(NotNow, match="is running") as refused:
-        rig.jogs.beat(Beat((RATE, 0.0)))
+        rig.jogs.beat(beat_of(RATE, 0.0))
     assert refused.value.code == "busy"
     go.set()
     rig.ended(pointing)
-    rig.jogs.beat(Beat((RATE, 0.0)))
+    rig.jogs.beat(beat_of(RATE, 0.0))
     with pytest.raises(NotNow, match="is running"):
         rig.operations.start({}, lambda record, cancelled: None)
 
@@ -208,51 +224,9 @@ def test_a_stop_is_the_last_word(rig: Rig) -> None:
     assert rig.ended(name).state == "stopped"
     moves = len(rig.head.moves)
     with pytest.raises(NotNow, match="does not run any more"):
-        rig.jogs.beat(Beat((RATE, 0.0), jog=name))
+        rig.beat(RATE, 0.0)
     rig.pass_by(0.5)
     assert len(rig.head.moves) == moves and not rig.devices.read().moving
-
-
-def test_nameless_heartbeats_begin_a_jog_only_half_a_second_after_a_stop(rig: Rig) -> None:
-    stops: list[object] = [object()]
-    jogs = Jogs(rig.operations, rig.devices, rig.clock, last_stop=lambda: stops[-1])
-    stick, still, counted = Beat((RATE, 0.0)), Beat((0.0, 0.0)), Beat((RATE, 0.0), sequence=8)
-
-    def refused(beat: Beat) -> str:
-        with pytest.raises(NotNow) as error, jogs.heard(beat) as may_begin:
-            jogs.beat(beat, may_begin)
-        return error.value.code
-
-    def taken(beat: Beat) -> str | None:
-        with jogs.heard(beat) as may_begin:
-            told: str | None = jogs.beat(beat, may_begin)["id"]
-        return told
-
-    first = taken(stick)
-    assert first is not None
-    rig.pass_by(0.3)
-    assert taken(stick) == first
-    with rig.clock.at_work():
-        rig.operations.stop()
-        stops.append(object())
-    rig.ended(first)
-    moves = len(rig.head.moves)
-    for _ in range(10):
-        assert refused(stick) == "jog_ended"
-        assert taken(still) is None
-        rig.pass_by(PATIENCE_S - 0.01)
-    assert len(rig.head.moves) == moves
-    rig.pass_by(0.02)
-    second = taken(Beat((RATE, 0.0), sequence=1))
-    assert second is not None
-    assert refused(counted) == "busy"
-    with rig.clock.at_work():
-        rig.operations.stop()
-        stops.append(object())
-    rig.ended(second)
-    assert refused(counted) == "jog_ended", "its number makes it none that begins"
-    rig.pass_by(PATIENCE_S + 0.01)
-    assert taken(counted) is not None
 
 
 def test_a_head_that_reports_a_fault_is_stopped(rig: Rig) -> None:
@@ -272,11 +246,11 @@ def test_a_daemon_that_was_held_up_goes_on_with_no_heartbeat_that_waited(
     def read() -> Reading:
         if held and rig.head.moves:
             rig.clock.sleep(held.pop())
-            rig.jogs.beat(Beat((RATE, 0.0)))  # it lay in the socket meanwhile
+            rig.beat(RATE, 0.0)  # it lay in the socket meanwhile
         return plain()
 
     monkeypatch.setattr(rig.devices, "read", read)
-    name = rig.jogs.beat(Beat((RATE, 0.0)))["id"]
+    name = rig.beat(RATE, 0.0)["id"]
     rig.pass_by(1.5)
     assert rig.ended(name).result.ended_because.startswith("the daemon was held up for 0.")
 
@@ -302,28 +276,12 @@ def test_the_head_slides_along_a_keep_out_and_never_nearer_than_its_margin(rig: 
 
 def test_faster_than_the_limit_is_the_limit_in_the_same_direction(rig: Rig) -> None:
     rig.place(-0.9, 0.0)
-    rig.jogs.beat(Beat((4.0, 2.0)))
+    rig.beat(4.0, 2.0)
     rig.pass_by(0.05)
     reading, (pan, tilt) = rig.head.moves[0]
     reach = [AHEAD_S * rate + rate**2 / 2 / 4.0 for rate in (1.0, 0.5)]
     assert pan - reading.pan_rad == pytest.approx(reach[0], abs=0.01)
     assert tilt - reading.tilt_rad == pytest.approx(reach[1], abs=0.01)
-
-
-def test_where_time_stands_a_client_that_is_gone_frees_the_head(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("mastctl.motion.jog.GONE_S", 0.2)
-    name = rig.jogs.beat(Beat((RATE, 0.0)))["id"]
-    ended = threading.Event()
-    for _ in range(600):  # of the machine's time: the rig's stands
-        if rig.operations.running is None:
-            break
-        ended.wait(0.05)
-    operation = rig.operations.get(name)
-    assert operation.state == "done"
-    assert "nothing was heard of its client" in operation.result.ended_because
-    assert rig.head.stops >= 1
 
 
 def test_a_jog_begins_before_or_after_what_needs_a_head_that_rests(rig: Rig) -> None:
@@ -332,7 +290,7 @@ def test_a_jog_begins_before_or_after_what_needs_a_head_that_rests(rig: Rig) -> 
     begun = threading.Event()
 
     def begin() -> None:
-        jogs.beat(Beat((RATE, 0.0)))
+        jogs.beat(beat_of(RATE, 0.0))
         begun.set()
 
     with changing:

@@ -7,8 +7,6 @@ other picture. Targets that the other picture does not show are left out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
 
@@ -22,9 +20,9 @@ from drivers.sim.scene import Scene, SceneSettings, build_scene
 from hil_tests.support.sim_survey.board import photograph
 from mastctl.devices.frames import StampedFrame
 from mastctl.experiment.targets import texture_mask
-from mastctl.motion.looking import CameraView, RigCameras
 from mastctl.motion.results import PointingError
 from mastctl.motion.settings import PointingSettings
+from mastctl.motion.views import CameraView, RigCameras
 from mastctl.packaged import config_folder
 
 TARGETS, SEEDS, RELIEF_M = 8, (1, 2), 0.5
@@ -33,18 +31,6 @@ NEAR_M, FAR_M = 1.8, 11.0
 BLUR_PX, NOISE_DN = 0.7, 2.0
 HIDDEN = 0.01
 """A point is hidden from a camera whose ray ends earlier by more than this part of the way."""
-
-
-class NoCameras:
-    """Pictures are given to the loop's cameras; they fetch none."""
-
-    def frames(
-        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float
-    ) -> dict[str, StampedFrame]:
-        return {}
-
-    def newest_frames(self) -> dict[str, StampedFrame | None]:
-        return {}
 
 
 def taken(rig: Rig, drawing: Renderer, rng: np.random.Generator) -> dict[str, CameraView]:
@@ -76,7 +62,7 @@ def errors_by_sigma(rig: Rig, seed: int) -> list[FloatArray]:
     rng = np.random.default_rng([seed, 0])
     drawing = Renderer(build_scene(SceneSettings(seed=seed, relief_m=RELIEF_M)), workers=1)
     views = taken(rig, drawing, rng)
-    cameras = RigCameras(NoCameras(), rig, PointingSettings())
+    cameras = RigCameras(None, rig, PointingSettings())  # type: ignore[arg-type]  # it takes none
     rows, columns = np.nonzero(texture_mask(views[LEFT].frame.image))
     found: list[FloatArray] = []
     given = 0

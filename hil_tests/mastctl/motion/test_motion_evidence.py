@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 import threading
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from drivers.errors import NoReply
 from hil_tests.mastctl.motion.pointing_world import SIZE_PX, World, clean, click, moving_world, rig, run
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
-from mastctl.motion.requests import Aim, PointRequest, PositionTarget
+from mastctl.motion.requests import Aim, PointRequest
 from mastctl.motion.results import PointingError, PointingResult
 from mastctl.motion.settings import PointingSettings
 
@@ -152,9 +153,12 @@ def between_the_pictures(world: World, act: Callable[[], object]) -> None:
     """Do something when the second picture of a pointing is asked for."""
     frames = world.frames
 
-    def later(cameras: Sequence[str], exposed_after_s: float, timeout_s: float) -> dict[str, StampedFrame]:
+    def later(
+        cameras: Sequence[str], exposed_after_s: float, timeout_s: float, check: Any = None
+    ) -> dict[str, StampedFrame]:
         if world.moves and len(cameras) == 1:
             act()
+            check()  # as the devices do while they wait
         return frames(cameras, exposed_after_s, timeout_s)
 
     world.frames = later  # type: ignore[method-assign]
@@ -173,12 +177,8 @@ def test_a_head_that_dithers_by_a_count_repeats_what_it_shows() -> None:
 
 @pytest.mark.parametrize("during", ["the head is watched", "the picture is waited for"])
 def test_a_stop_before_the_second_picture_ends_the_pointing_at_once(during: str) -> None:
-    world, cancelled, go_on = World(), threading.Event(), threading.Event()
+    world, cancelled = World(), threading.Event()
     reads = world.read
-
-    def stop() -> None:
-        cancelled.set()
-        go_on.wait(60.0)
 
     def read() -> HeadReading:
         if world.moves and world.clock.now_s() > world._begun_s + 1.0:  # the move takes 0.2 s
@@ -187,10 +187,9 @@ def test_a_stop_before_the_second_picture_ends_the_pointing_at_once(during: str)
 
     if during == "the head is watched":
         world.read = read  # type: ignore[method-assign]
-    between_the_pictures(world, stop)
+    between_the_pictures(world, cancelled.set)
     with pytest.raises(PointingError) as refused:
         run(world, click(world.shoot(), *CLICK_PX), cancelled=cancelled)
-    go_on.set()
     assert (refused.value.code, refused.value.step, refused.value.result) == ("stopped", "repeat", None)
 
 
@@ -240,7 +239,7 @@ def test_a_pattern_that_repeats_with_the_move_is_said_to_be_too_plain() -> None:
     tile = np.random.default_rng(3).integers(40, 220, (6, 6), dtype=np.uint8)
     pattern = np.tile(np.kron(tile, np.ones((4, 4), np.uint8)), (10, 13))[: SIZE_PX[1], : SIZE_PX[0]]
     world.image = lambda camera, number, image: pattern.copy()
-    result, _ = run(world, PointRequest(PositionTarget((4.0, 0.02, 0.0))))
+    result, _ = run(world, PointRequest(position_m=[4.0, 0.02, 0.0]))
     assert result.pointings[0].motion_evidence["navcam_left"]["verdict"] == "too_plain"
 
 
@@ -262,7 +261,9 @@ def without(world: World, *dead: str) -> None:
     """Some cameras do not answer."""
     frames = world.frames
 
-    def fewer(cameras: Sequence[str], exposed_after_s: float, timeout_s: float) -> dict[str, StampedFrame]:
+    def fewer(
+        cameras: Sequence[str], exposed_after_s: float, timeout_s: float, check: Any = None
+    ) -> dict[str, StampedFrame]:
         for camera in cameras:
             if camera in dead:
                 raise NoReply("unplugged", device=camera)
@@ -275,14 +276,14 @@ def test_a_stale_picture_is_told_though_the_partner_does_not_answer() -> None:
     world = World()
     without(world, "navcam_right")
     buffered(world)
-    error = refusal(world, PointRequest(PositionTarget((4.0, 0.7, 0.0))))
+    error = refusal(world, PointRequest(position_m=[4.0, 0.7, 0.0]))
     assert error.code == "bad_frame" and "that of before the move" in str(error)
 
 
 def test_an_aiming_camera_that_is_silent_before_the_move_moves_nothing() -> None:
     world = World()
     without(world, "navcam_left")
-    error = refusal(world, PointRequest(PositionTarget((4.0, 0.7, 0.0))))
+    error = refusal(world, PointRequest(position_m=[4.0, 0.7, 0.0]))
     assert (error.code, error.step) == ("no_reply", "before") and not world.moves
 
 

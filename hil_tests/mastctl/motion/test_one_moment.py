@@ -7,9 +7,9 @@ import pytest
 
 from hil_tests.mastctl.motion.pointing_world import LATE_S, World, click, moving_world, rig, run
 from mastctl.motion.evidence import check_one_moment
-from mastctl.motion.looking import RigCameras
 from mastctl.motion.results import PointingError, Step
 from mastctl.motion.settings import PointingSettings
+from mastctl.motion.views import RigCameras
 
 
 def detail(steps: list[Step], name: str) -> dict[str, object]:
@@ -29,11 +29,10 @@ def test_eyes_that_expose_apart_measure_what_stands_still() -> None:
 
 def checked(world: World) -> dict[str, object]:
     """What the check says of a pair that is taken now."""
-    settings = PointingSettings()
-    eyes, resting = RigCameras(world, rig(), settings), world.read()
-    views = eyes.new(("navcam_left", "navcam_right"), world.clock.now_s(), resting)
+    cameras, resting = RigCameras(world, rig(), PointingSettings()), world.read()
+    views = cameras.new(("navcam_left", "navcam_right"), world.clock.now_s(), resting)
     one, other = views["navcam_left"], views["navcam_right"]
-    return check_one_moment(eyes, settings, one, np.array([150.0, 120.0]), [other], resting)
+    return check_one_moment(cameras, one, np.array([150.0, 120.0]), [other], resting)
 
 
 def test_what_moves_by_half_a_pixel_between_the_eyes_is_not_measured() -> None:

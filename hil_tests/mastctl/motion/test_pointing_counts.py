@@ -9,7 +9,7 @@ import pytest
 
 from calib.files.mast_file import load_rig
 from drivers.interfaces import AxisReport
-from mastctl.motion.results import counts_told
+from mastctl.motion.results import counts_left
 
 COUNT_RAD = math.tau / 4096
 
@@ -27,7 +27,7 @@ class Counting:
 
 def test_counts_and_the_pixels_that_they_leave(repository: Path) -> None:
     model = load_rig(repository / "configs" / "sim" / "rocky8.yaml").rig.cameras["navcam_left"].model
-    told = counts_told(Counting(), 0.3, model)["counts"]
+    told = counts_left(Counting(), 0.3, model)["counts"]
     assert told["pan"]["goal_counts"] == told["pan"]["measured_counts"] == 2148
     assert told["pan"]["came_from"] == "positive"
     assert told["pan"]["left_rad"] == pytest.approx(-0.4 * COUNT_RAD, abs=1e-7)

@@ -7,7 +7,7 @@ fault words of its panel, through the service's own devices.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,8 +25,9 @@ from mastctl.devices.devices import Devices
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.limits import Limits
 from mastctl.motion.loop import PointingLoop
-from mastctl.motion.requests import AnglesTarget, PixelTarget, PointRequest
+from mastctl.motion.requests import PixelTarget, PointRequest
 from mastctl.motion.results import PointingError, PointingResult, Step
+from mastctl.motion.settings import PointingSettings
 from mastctl.packaged import config_folder
 
 MIDDLE_PX = ((SIZE_PX[0] - 1) / 2, (SIZE_PX[1] - 1) / 2)
@@ -139,19 +140,27 @@ class Rover:
         )
         limits = Limits((-2.6, 2.6), (-1.2, 0.5), 1.0)
         self.devices = Devices(self.hardware, limits, "0" * 64, self.clock, self.rig)
-        self.loop = PointingLoop(self.rig, self.devices, limits, self.clock)
+        self.limits = limits
         assert self.hardware.simulation is not None
         self.truth = self.hardware.simulation
 
     def begin(self) -> tuple[PixelTarget, np.ndarray]:
         """Look at the ground some 4 m away and click on it."""
         self.truth.faults.clear()
-        self.loop.run(PointRequest(AnglesTarget(0.1, -0.3)), lambda step: None, threading.Event())
+        self.point(PointRequest(pan_rad=0.1, tilt_rad=-0.3))
         frame = self._first_frame()
         pixel = (220.0, 90.0)
         point = self.truth.true_point("navcam_left", frame.sequence, pixel)
         assert point is not None
         return PixelTarget("navcam_left", frame.frame_id, *pixel), point
+
+    def point(
+        self, request: PointRequest, record: Callable[[Step], None] = lambda step: None
+    ) -> PointingResult:
+        settings, stopped = PointingSettings(), threading.Event()
+        return PointingLoop(self.rig, self.devices, self.limits, self.clock, settings, record, stopped).run(
+            request
+        )
 
     def _first_frame(self) -> StampedFrame:
         """Return a frame of the left camera, which refuses calls until a driver that hung has returned."""
@@ -191,7 +200,7 @@ def rover(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rover]:
 
 def test_the_healthy_rover_points_and_measures_what_is_true(rover: Rover) -> None:
     target, point = rover.begin()
-    result = rover.loop.run(PointRequest(target, pointings=2), lambda step: None, threading.Event())
+    result = rover.point(PointRequest(pixel=target, pointings=2))
     residual = result.pointings[-1].residual_px
     assert residual is not None
     truth = rover.true_residual_px(result, point)
@@ -239,11 +248,11 @@ def test_a_fault_ends_a_pointing_by_its_own_code_or_does_no_harm(
     expected = FAULTS[device, word, after]
     if expected is not None:
         with pytest.raises(PointingError) as refusal:
-            rover.loop.run(PointRequest(target), record, threading.Event())
+            rover.point(PointRequest(pixel=target), record)
         assert refusal.value.code == expected, str(refusal.value)
         assert rover.clock.now_s() - begun_s < LONGEST_S + 30.0
         return
-    result = rover.loop.run(PointRequest(target), record, threading.Event())
+    result = rover.point(PointRequest(pixel=target), record)
     residual = result.pointings[-1].residual_px
     assert residual is not None
     assert np.abs(np.array(residual) - rover.true_residual_px(result, point)).max() < RIGHT_ANYWAY_PX

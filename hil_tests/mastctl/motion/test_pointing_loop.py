@@ -6,7 +6,7 @@ import json
 import threading
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -16,15 +16,15 @@ from hil_tests.mastctl.motion.pointing_world import (
     SIZE_PX,
     World,
     click,
+    loop_of,
     rig,
     rock,
     run,
     true_camera,
 )
 from mastctl.as_json import as_json
-from mastctl.motion.loop import PointingLoop
-from mastctl.motion.requests import Aim, AnglesTarget, PixelTarget, PointRequest, PositionTarget
-from mastctl.motion.results import PointingError, Preview, Step
+from mastctl.motion.requests import Aim, PixelTarget, PointRequest
+from mastctl.motion.results import PointingError, Step
 from mastctl.motion.settings import PointingSettings
 
 MIDDLE_PX = ((SIZE_PX[0] - 1) / 2, (SIZE_PX[1] - 1) / 2)
@@ -64,8 +64,7 @@ def test_a_position_is_as_sure_as_the_pixels_and_the_match_behind_it() -> None:
         frame = world.shoot()
         settings = PointingSettings(triangulation_sigma_px=pixel_sigma_px)
         steps: list[Step] = []
-        loop = PointingLoop(rig(), world, LIMITS, world.clock, settings)
-        loop.run(click(frame, 150.0, 120.0), steps.append, threading.Event())
+        loop_of(world, steps, settings=settings).run(click(frame, 150.0, 120.0))
         frames, stereo, place = (
             next(s.detail for s in steps if s.name == name) for name in ("frames", "stereo", "triangulate")
         )
@@ -148,7 +147,7 @@ def test_a_position_is_pointed_at_and_its_missing_residual_is_explained(
     frame: Literal["rover", "site"],
 ) -> None:
     world = World()
-    result, steps = run(world, PointRequest(PositionTarget((4.0, 0.7, 0.0), frame)))
+    result, steps = run(world, PointRequest(position_m=[4.0, 0.7, 0.0], frame=frame))
     (pointing,) = result.pointings
     assert pointing.residual_px is None
     assert pointing.residual_sigma_px is None
@@ -183,9 +182,9 @@ def test_the_new_picture_is_exposed_after_the_head_has_settled() -> None:
 def test_a_target_beyond_the_limits_is_refused_and_nothing_moves() -> None:
     world = World()
     steps: list[Step] = []
-    loop = PointingLoop(rig(), world, LIMITS, world.clock)
+    loop = loop_of(world, steps)
     with pytest.raises(PointingError, match="beyond the limit") as refusal:
-        loop.run(PointRequest(PositionTarget((-4.0, 0.1, 0.0))), steps.append, threading.Event())
+        loop.run(PointRequest(position_m=[-4.0, 0.1, 0.0]))
     assert refusal.value.code == "outside_limits"
     assert refusal.value.step == "solve"
     assert steps[-1].state == "failed"
@@ -195,25 +194,28 @@ def test_a_target_beyond_the_limits_is_refused_and_nothing_moves() -> None:
 
 
 BAD = {
-    "unknown_camera": PointRequest(PixelTarget("fishcam", "navcam_left-000001", 1, 1)),
-    "frame_unknown": PointRequest(PixelTarget("navcam_left", "navcam_left-000099", 1, 1)),
-    "wrong_camera": PointRequest(PixelTarget("navcam_right", "navcam_left-000001", 1, 1)),
-    "outside_image": PointRequest(PixelTarget("navcam_left", "navcam_left-000001", 300.0, 1)),
-    "bad_aim": PointRequest(PositionTarget((4.0, 0.0, 0.0)), aim=Aim("fishcam", 1, 1)),
-    "outside_image ": PointRequest(PositionTarget((4.0, 0.0, 0.0)), aim=Aim("navcam_left", 1, 240.0)),
-    "outside_limits": PointRequest(AnglesTarget(2.0, 0.0)),
-    "target_border": PointRequest(PixelTarget("navcam_left", "navcam_left-000001", 2.0, 120.0)),
+    "unknown_camera": PointRequest(pixel=PixelTarget("fishcam", "navcam_left-000001", 1, 1)),
+    "frame_unknown": PointRequest(pixel=PixelTarget("navcam_left", "navcam_left-000099", 1, 1)),
+    "wrong_camera": PointRequest(pixel=PixelTarget("navcam_right", "navcam_left-000001", 1, 1)),
+    "outside_image": PointRequest(pixel=PixelTarget("navcam_left", "navcam_left-000001", 300.0, 1)),
+    "bad_aim": PointRequest(position_m=[4.0, 0.0, 0.0], aim=Aim("fishcam", 1, 1)),
+    "outside_image ": PointRequest(position_m=[4.0, 0.0, 0.0], aim=Aim("navcam_left", 1, 240.0)),
+    "outside_limits": PointRequest(pan_rad=2.0, tilt_rad=0.0),
+    "target_border": PointRequest(pixel=PixelTarget("navcam_left", "navcam_left-000001", 2.0, 120.0)),
 }
 
 
 NO_REQUEST: dict[str, Callable[[], object]] = {
-    "finite number": lambda: PositionTarget((1.0, float("nan"), 0.0)),
+    "finite number": lambda: PointRequest(position_m=[1.0, float("nan"), 0.0]),
     "finite number ": lambda: PixelTarget("navcam_left", "navcam_left-000001", float("nan"), 1),
-    "'rover' or 'site'": lambda: PositionTarget((1.0, 0.0, 0.0), "board"),  # type: ignore[arg-type]
-    "valid number": lambda: AnglesTarget(True, 0.0),
-    "goes with pixel only": lambda: PointRequest(PositionTarget((4.0, 0.0, 0.0)), pointings=2),
-    "not with joint angles": lambda: PointRequest(AnglesTarget(0.0, 0.0), Aim("navcam_left", 1, 1)),
-    "less than or equal to 2": lambda: PointRequest(AnglesTarget(0.0, 0.0), pointings=3),
+    "'rover' or 'site'": lambda: PointRequest(
+        position_m=[1.0, 0.0, 0.0],
+        frame="board",  # type: ignore[arg-type]
+    ),
+    "valid number": lambda: PointRequest(pan_rad=True, tilt_rad=0.0),
+    "goes with pixel only": lambda: PointRequest(position_m=[4.0, 0.0, 0.0], pointings=2),
+    "not with joint angles": lambda: PointRequest(pan_rad=0.0, tilt_rad=0.0, aim=Aim("navcam_left", 1, 1)),
+    "less than or equal to 2": lambda: PointRequest(pan_rad=0.0, tilt_rad=0.0, pointings=3),
 }
 
 
@@ -245,9 +247,9 @@ def test_cancelling_during_the_move_stops_the_head() -> None:
 
     world.on_read = cancel_under_way
     steps: list[Step] = []
-    loop = PointingLoop(rig(), world, LIMITS, world.clock)
+    loop = loop_of(world, steps, cancelled=cancelled)
     with pytest.raises(PointingError) as refusal:
-        loop.run(click(frame, 90.0, 60.0), steps.append, cancelled)
+        loop.run(click(frame, 90.0, 60.0))
     assert refusal.value.code == "stopped"
     assert steps[-1].name == "settle"
     assert world.stops == 1
@@ -269,9 +271,8 @@ def test_a_failure_after_the_first_pointing_keeps_its_result() -> None:
     assert refusal.value.result.pointings[0].residual_px is not None
 
 
-def preview(world: World, request: PointRequest) -> Preview:
-    loop = PointingLoop(rig(), world, LIMITS, world.clock, PointingSettings())
-    return loop.preview(request, threading.Event())
+def preview(world: World, request: PointRequest) -> Any:
+    return loop_of(world, []).preview(request)
 
 
 def test_a_preview_tells_what_a_pointing_then_finds_and_nothing_moves() -> None:
@@ -280,13 +281,13 @@ def test_a_preview_tells_what_a_pointing_then_finds_and_nothing_moves() -> None:
     point = world.true_point(frame, *pixel)
     told = preview(world, click(frame, *pixel))
     assert (world.moves, world.stops) == ([], 0)
-    assert told.other_camera == "navcam_right" and told.refused is None
-    assert np.abs(np.array(told.pixel_px) - pixel).max() < 0.2
-    off_m = np.array(told.position_m) - point
-    assert (np.abs(off_m) < 4 * np.array(told.sigma_m) + 1e-3).all()
-    assert told.range_sigma_m <= np.linalg.norm(told.sigma_m) + 1e-12
+    assert told["other_camera"] == "navcam_right" and told["refused"] is None
+    assert np.abs(np.array(told["pixel_px"]) - pixel).max() < 0.2
+    off_m = np.array(told["position_m"]) - point
+    assert (np.abs(off_m) < 4 * np.array(told["sigma_m"]) + 1e-3).all()
+    assert told["range_sigma_m"] <= np.linalg.norm(told["sigma_m"]) + 1e-12
     result, _ = run(world, click(frame, *pixel))
-    assert told.goal_rad == pytest.approx(
+    assert told["goal_rad"] == pytest.approx(
         (result.pointings[0].commanded_pan_rad, result.pointings[0].commanded_tilt_rad), abs=2e-3
     )
 
@@ -294,10 +295,8 @@ def test_a_preview_tells_what_a_pointing_then_finds_and_nothing_moves() -> None:
 def test_a_preview_of_what_the_head_cannot_reach_still_tells_where_it_is() -> None:
     world = World()
     frame = world.shoot()
-    loop = PointingLoop(
-        rig(), world, replace(LIMITS, tilt_rad=(-0.001, 0.001)), world.clock, PointingSettings()
-    )
-    told = loop.preview(click(frame, 150.0, 60.0), threading.Event())
-    assert told.range_m > 0.5
-    assert told.refused is not None and told.refused["code"] == "outside_limits", told.refused
+    level = replace(LIMITS, tilt_rad=(-0.001, 0.001))
+    told = loop_of(world, [], limits=level).preview(click(frame, 150.0, 60.0))
+    assert told["range_m"] > 0.5
+    assert told["refused"] is not None and told["refused"]["code"] == "outside_limits", told["refused"]
     assert (world.moves, world.stops) == ([], 0)

@@ -17,8 +17,8 @@ from calib.geometry.rigid import Rigid, carried_covariance
 from mastctl.devices.limits import Limits
 from mastctl.errors import MastctlError
 from mastctl.motion.pairs import choose_pairs
+from mastctl.motion.poses import HELD_UP_S, RoverPose, check_follows, motion_between, stands
 from mastctl.motion.settings import HandoffRules, PairBounds
-from mastctl.motion.track import HELD_UP_S, RoverPose, check_follows, motion_between, stands
 
 
 @pytest.fixture(scope="module")

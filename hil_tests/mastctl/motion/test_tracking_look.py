@@ -20,9 +20,8 @@ from hil_tests.mastctl.motion.pointing_world import LIMITS, SIZE_PX, World, rig
 from mastctl.devices.frames import StampedFrame
 from mastctl.motion.requests import PixelTarget
 from mastctl.motion.results import PointingError, Step
-from mastctl.motion.settings import PointingSettings, TrackingSettings
-from mastctl.motion.steps import Steps
-from mastctl.motion.target_look import Looker, NotTrackable
+from mastctl.motion.search import NotTrackable, TargetSearch
+from mastctl.motion.settings import TrackingSettings
 
 PIXEL = (110.0, 130.0)
 Paint = Callable[[str, int, np.ndarray], np.ndarray]
@@ -35,7 +34,11 @@ class Eyes(World):
     silent: tuple[str, ...] = ()
 
     def frames(
-        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float
+        self,
+        cameras: Sequence[str],
+        exposed_after_s: float,
+        timeout_s: float,
+        check: Callable[[], None] | None = None,
     ) -> dict[str, StampedFrame]:
         for camera in cameras:
             if camera in self.silent:
@@ -43,17 +46,16 @@ class Eyes(World):
         return super().frames(cameras, exposed_after_s, timeout_s)
 
 
-def looker(world: World, steps: list[Step] | None = None, believed: Rig | None = None) -> Looker:
-    told = [] if steps is None else steps
-    believed = believed or rig()
-    made = Steps(believed, world, LIMITS, world.clock, PointingSettings(), told.append, threading.Event())
-    return Looker(made, believed, LIMITS, TrackingSettings())
+def search(world: World, steps: list[Step] | None = None, believed: Rig | None = None) -> TargetSearch:
+    record = ([] if steps is None else steps).append
+    settings, stopped = TrackingSettings(), threading.Event()
+    return TargetSearch(believed or rig(), world, LIMITS, world.clock, settings, record, stopped)
 
 
 def begun(world: World) -> tuple[Track, np.ndarray]:
     """A track of what a pixel shows, and where that truly is."""
     frame = world.shoot()
-    track, seen = looker(world).begin_at_pixel(PixelTarget("navcam_left", frame.frame_id, *PIXEL))
+    track, seen = search(world).begin_at_pixel(PixelTarget("navcam_left", frame.frame_id, *PIXEL))
     assert seen.pair == "navcam" and list(seen.pixels) == ["navcam_left", "navcam_right"]
     return track, world.true_point(frame, *PIXEL)
 
@@ -73,7 +75,7 @@ def test_a_start_and_a_look_put_the_target_where_it_is() -> None:
     steps: list[Step] = []
     track, point = begun(world)
     assert np.linalg.norm(track.position_m - point) < 0.03
-    after, seen = looker(world, steps).look(track)
+    after, seen = search(world, steps).find(track)
     assert (seen.state, seen.pair, seen.reason) == ("tracked", "navcam", "")
     assert np.linalg.norm(after.position_m - point) < 0.03
     assert [step.name for step in steps] == ["choose", "before", "limits", "move", "settle", "look", "find"]
@@ -111,43 +113,43 @@ def test_what_cannot_be_followed_is_refused_with_the_reason(paint: Paint, words:
 def test_a_position_starts_with_what_is_there_and_nothing_else() -> None:
     world = Eyes()
     point = world.true_point(world.shoot(), *PIXEL)
-    track, seen = looker(world).begin_at_position(point)
+    track, seen = search(world).begin_at_position(point)
     assert np.linalg.norm(track.position_m - point) < 0.03
     assert seen.pair == "navcam"
     with pytest.raises(NotTrackable, match=r"m from it; at most 0\.\d\d m is expected"):
-        looker(world).begin_at_position(point - np.array([0.0, 0.0, 0.5]))
+        search(world).begin_at_position(point - np.array([0.0, 0.0, 0.5]))
     with pytest.raises(CalibError, match="no stereo pair sees the target"):
-        looker(world).begin_at_position(np.array([-3.0, 0.0, 0.0]))
+        search(world).begin_at_position(np.array([-3.0, 0.0, 0.0]))
 
 
 def test_one_camera_keeps_a_target_but_does_not_find_a_lost_one() -> None:
     world = Eyes()
     track, point = begun(world)
     world.silent = ("navcam_right", "pancam_left", "pancam_right")
-    after, seen = looker(world).look(track)
+    after, seen = search(world).find(track)
     assert seen.state == "tracked"
     assert (seen.pixels["navcam_right"].verdict, seen.pixels["navcam_left"].verdict) == ("no_frame", "good")
     assert seen.pixels["navcam_right"].reason == "navcam_right: unplugged"
     assert np.linalg.norm(after.position_m - point) < 0.03
     world.image = covered("navcam_left")
-    lost, seen = looker(world).look(after)
+    lost, seen = search(world).find(after)
     assert (lost.state, lost.misses) == ("lost", 1)
     assert "navcam_right: unplugged" in seen.reason
     world.image = lambda camera, number, image: image
-    assert looker(world).look(lost)[1].state == "lost", "one eye alone"
+    assert search(world).find(lost)[1].state == "lost", "one eye alone"
     world.silent = ()
-    assert looker(world).look(lost)[1].state == "tracked"
+    assert search(world).find(lost)[1].state == "tracked"
 
 
 def test_the_next_pair_looks_where_the_first_finds_nothing() -> None:
     world = Eyes()
     track, point = begun(world)
     world.image = covered("navcam_left", "navcam_right")
-    after, seen = looker(world).look(track)
+    after, seen = search(world).find(track)
     assert (seen.state, seen.pair) == ("tracked", "pancam")
     assert np.linalg.norm(after.position_m - point) < 0.03
     world.image = covered("navcam_left", "navcam_right", "pancam_left", "pancam_right")
-    assert looker(world).look(track)[1].pair == "navcam", "the first pair says why"
+    assert search(world).find(track)[1].pair == "navcam", "the first pair says why"
 
 
 def navcams_turned(by_rad: float) -> Rig:
@@ -173,7 +175,7 @@ def test_pictures_that_did_not_move_with_the_head_are_not_looked_at(
         (start[0] + share * (joints[0] - start[0]), start[1] + share * (joints[1] - start[1]))
     )
     world.silent = silent
-    after, seen = looker(world).look(track)
+    after, seen = search(world).find(track)
     assert (after.state, seen.state) == ("lost", "lost")
     assert after.position_m == pytest.approx(track.position_m)
     for eye in rig().stereo["navcam"]:
@@ -186,7 +188,7 @@ def test_a_change_of_the_pair_looks_with_both_and_keeps_what_they_saw() -> None:
     world = Eyes()
     steps: list[Step] = []
     track, point = begun(world)
-    after, seen = looker(world, steps).look(track, "pancam")
+    after, seen = search(world, steps).find(track, "pancam")
     assert (seen.state, seen.pair, seen.reason) == ("tracked", "navcam", "")
     assert np.linalg.norm(after.position_m - point) < 0.03
     one = ["limits", "move", "settle", "look", "find"]
@@ -206,7 +208,7 @@ def test_a_change_of_the_pair_looks_with_both_and_keeps_what_they_saw() -> None:
         frame = world.frame_by_id(frames[eye])
         assert (at.pan_rad, at.tilt_rad) == (frame.pan_rad, frame.tilt_rad)
     assert record.joints.tilt_rad != record.to_joints.tilt_rad
-    assert looker(world).look(after, "navcam")[1].matched is None, "the same pair looks on"
+    assert search(world).find(after, "navcam")[1].matched is None, "the same pair looks on"
 
 
 def test_a_turned_pair_is_recorded_and_takes_over_only_within_bounds() -> None:
@@ -216,11 +218,11 @@ def test_a_turned_pair_is_recorded_and_takes_over_only_within_bounds() -> None:
         0.003
     )  # 645 px of focal length: targets lie 1.9 px to the left of where believed
     surely = replace(track, covariance_m2=1e-6 * np.eye(3))
-    _, seen = looker(world, None, believed).look(surely, "pancam")
+    _, seen = search(world, None, believed).find(surely, "pancam")
     assert (seen.state, seen.pair) == ("tracked", "pancam")
     assert seen.reason.startswith("navcam does not take over: the match does not fit the prediction")
     roughly = replace(track, covariance_m2=2e-2**2 * np.eye(3))  # as after half a metre of driving
-    _, taken = looker(world, None, believed).look(roughly, "pancam")
+    _, taken = search(world, None, believed).find(roughly, "pancam")
     assert (taken.state, taken.pair) == ("tracked", "navcam")
     for matched in (seen.matched, taken.matched):
         assert matched is not None
@@ -236,24 +238,24 @@ def test_a_pose_that_the_pictures_contradict_is_told_by_the_look(found_by: str) 
     track, _ = begun(world)
     told = np.diag([1e-3**2] * 3 + [0.015**2] * 3)
     said = moved_track(track, Rigid(np.eye(3), np.array([0.0, -0.12, 0.0])), told)
-    _, seen = looker(world, steps).look(said, found_by)
+    _, seen = search(world, steps).find(said, found_by)
     off = re.search(r"([\d.]+) cm \(([\d.]+) sigma\) from where the pose", seen.pose_doubt)
     assert off is not None and float(off[1]) == pytest.approx(12.0, abs=1.5) and float(off[2]) > 4.0
     assert any(step.detail.get("pose_doubt") == seen.pose_doubt for step in steps)
     honest = moved_track(track, Rigid(np.eye(3), np.zeros(3)), told)
-    assert looker(world).look(honest, found_by)[1].pose_doubt == ""
+    assert search(world).find(honest, found_by)[1].pose_doubt == ""
 
 
 def test_without_the_former_pairs_pictures_the_next_looks_alone() -> None:
     world = Eyes()
     track, point = begun(world)
     world.silent = ("pancam_left", "pancam_right")
-    after, seen = looker(world).look(track, "pancam")
+    after, seen = search(world).find(track, "pancam")
     assert (seen.state, seen.pair, seen.matched) == ("tracked", "navcam", None)
     assert np.linalg.norm(after.position_m - point) < 0.03
     world.silent = ("pancam_left", "pancam_right", "navcam_left", "navcam_right")
-    assert looker(world).look(track, "pancam")[1].reason == "navcam_left: unplugged; navcam_right: unplugged"
+    assert search(world).find(track, "pancam")[1].reason == "navcam_left: unplugged; navcam_right: unplugged"
     world.silent = ("navcam_left", "navcam_right")
-    _, seen = looker(world).look(track, "pancam")
+    _, seen = search(world).find(track, "pancam")
     assert (seen.state, seen.pair, seen.matched) == ("tracked", "pancam", None)
     assert seen.reason == "navcam does not take over: navcam_left: unplugged; navcam_right: unplugged"

@@ -30,25 +30,27 @@ from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.motion import tracker as tracker_module
-from mastctl.motion.target_look import EyePixel, TrackSighting
+from mastctl.motion.search import CameraPixel, TrackSighting
+from mastctl.motion.settings import PointingSettings
+from mastctl.motion.steps import Steps
 
 TARGET_M = (5.0, 0.5, 0.0)
 SIGMA = (0.01, 0.005)
 LOGGED = "tracking: {{handoff_log: handed/over.jsonl}}\n"
 
 
-class ScriptedLooker:
-    """Stands for `Looker`: a start is at `TARGET_M`; a look is what ``script(track)`` makes of it."""
+class ScriptedSearch(Steps):
+    """Stands for `TargetSearch`: a start is at `TARGET_M`; a look is what ``script(track)`` makes of it."""
 
     script: Callable[[Track], tuple[Track, TrackSighting]]
     begin: Callable[[], None] = lambda: None
     looks: list[Track]
 
-    def __init__(self, steps: Any, *others: Any) -> None:
-        self._steps = steps
+    def __init__(self, rig: Any, devices: Any, limits: Any, clock: Any, settings: Any, *others: Any) -> None:
+        super().__init__(rig, devices, limits, clock, PointingSettings(), *others)
 
     def begin_at_pixel(self, target: Any) -> tuple[Track, TrackSighting]:
-        with self._steps.step("start"):
+        with self.step("start"):
             type(self).begin()
         camera = rig().cameras["navcam_left"].model
         key = KeyPicture(
@@ -62,15 +64,15 @@ class ScriptedLooker:
         track = replace(track, position_m=position_m)
         return track, replace(told, position_m=position_m)
 
-    def look(self, track: Track, found_by: str = "") -> tuple[Track, TrackSighting]:
-        with self._steps.step("find"):
+    def find(self, track: Track, found_by: str = "") -> tuple[Track, TrackSighting]:
+        with self.step("find"):
             type(self).looks.append(track)
         return type(self).script(track)
 
 
 def seen(track: Track, pair: str = "navcam", reason: str = "") -> TrackSighting:
     """A look that leaves the track where it is."""
-    pixel = EyePixel("navcam_left-000001-x", "good", "", 31.5, 20.0, (0.1, 0.1), 0.95)
+    pixel = CameraPixel("navcam_left-000001-x", "good", "", 31.5, 20.0, (0.1, 0.1), 0.95)
     return TrackSighting(
         track.state, reason, pair, track.position_m, track.covariance_m2, 5.0, {"navcam_left": pixel}, 1.0
     )
@@ -88,10 +90,10 @@ def lost(track: Track) -> tuple[Track, TrackSighting]:
 
 @pytest.fixture
 def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[tuple[RunningDaemon, FakeHardware]]:
-    monkeypatch.setattr(tracker_module, "Looker", ScriptedLooker)
-    monkeypatch.setattr(ScriptedLooker, "script", staticmethod(found), raising=False)
-    monkeypatch.setattr(ScriptedLooker, "begin", staticmethod(lambda: None))
-    monkeypatch.setattr(ScriptedLooker, "looks", [], raising=False)
+    monkeypatch.setattr(tracker_module, "TargetSearch", ScriptedSearch)
+    monkeypatch.setattr(ScriptedSearch, "script", staticmethod(found), raising=False)
+    monkeypatch.setattr(ScriptedSearch, "begin", staticmethod(lambda: None))
+    monkeypatch.setattr(ScriptedSearch, "looks", [], raising=False)
     with fake_daemon(monkeypatch, tmp_path, config=CONFIG + LOGGED) as made:
         yield made
 
@@ -148,8 +150,8 @@ def test_the_suns_keep_out_knows_a_pose_before_the_look_from_it_begins(
 ) -> None:
     started(client)
     called: list[str] = []
-    door, operations = daemon.service.devices.door, daemon.service.operations
-    stands, start = door.rover_stands, operations.start
+    judge, operations = daemon.service.devices.judge, daemon.service.operations
+    stands, start = judge.rover_stands, operations.start
 
     def rover_stands(rover_from_site: Any) -> None:
         called.append("stands")
@@ -159,7 +161,7 @@ def test_the_suns_keep_out_knows_a_pose_before_the_look_from_it_begins(
         called.append("look")
         return start(*work)
 
-    monkeypatch.setattr(door, "rover_stands", rover_stands)
+    monkeypatch.setattr(judge, "rover_stands", rover_stands)
     monkeypatch.setattr(operations, "start", begin)
     drive(client, 0.5, 2.0)
     assert called == ["stands", "look"]
@@ -171,12 +173,12 @@ def test_a_lost_target_stays_lost_with_its_reason_until_a_look_finds_it(
     client: Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     started(client)
-    monkeypatch.setattr(ScriptedLooker, "script", staticmethod(lost))
+    monkeypatch.setattr(ScriptedSearch, "script", staticmethod(lost))
     track = drive(client, 0.5, 2.0)
     assert (track["state"], track["misses"]) == ("lost", 1)
     assert track["reason"] == "navcam_left: a stone is in the way"
     assert drive(client, 0.9, 3.0)["misses"] == 2
-    monkeypatch.setattr(ScriptedLooker, "script", staticmethod(found))
+    monkeypatch.setattr(ScriptedSearch, "script", staticmethod(found))
     track = client.wait_track(client.look())
     assert (track["state"], track["reason"], track["misses"]) == ("tracking", "", 0)
 
@@ -188,7 +190,7 @@ def test_a_pose_that_jumps_loses_the_target_and_looks_nowhere(client: Client) ->
     assert track["state"] == "lost"
     assert "the pose jumped by 2.50 m" in track["reason"]
     assert "at most 0.3 of the range" in track["reason"]
-    assert len(ScriptedLooker.looks) == 1
+    assert len(ScriptedSearch.looks) == 1
     assert "jumped" in refusal(client.look, "no_track")
     assert client.track()["position_in_site_m"] == pytest.approx(TARGET_M)
     assert client.track()["position_m"] == pytest.approx([2.0, 0.5, 0.0])
@@ -196,7 +198,7 @@ def test_a_pose_that_jumps_loses_the_target_and_looks_nowhere(client: Client) ->
     # The next pose is near again: the track goes on from where it stood, both jumps' uncertainty with it.
     track = drive(client, 0.6, 4.0)
     assert track["state"] == "tracking"
-    assert ScriptedLooker.looks[-1].state == "lost", "both eyes must find it after a jump"
+    assert ScriptedSearch.looks[-1].state == "lost", "both eyes must find it after a jump"
     assert track["position_m"] == pytest.approx([4.4, 0.5, 0.0])
     turned = 0.01**2 + (4.5 * 0.005) ** 2 + 1e-4  # at 0.5 m
     # To 3.0 m and back: that far away the target's lever was 2 m, here it is 4.4 m.
@@ -219,14 +221,14 @@ def test_poses_that_run_backwards_or_say_too_little_are_refused(client: Client) 
     assert track["state"] == "lost", "but what stood still is not where the rover was said to go"
     assert "moved by 0.10 m" in track["reason"]
     assert drive(client, 0.1, 3.0)["state"] == "tracking"
-    assert ScriptedLooker.looks[-1].state == "lost", "both eyes must find it after that"
+    assert ScriptedSearch.looks[-1].state == "lost", "both eyes must find it after that"
 
 
 def test_a_first_pose_while_a_track_begins_ends_it_and_its_motion(
     client: Client, pair: tuple[RunningDaemon, FakeHardware], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun, goes_on = threading.Event(), threading.Event()
-    monkeypatch.setattr(ScriptedLooker, "begin", staticmethod(lambda: (begun.set(), goes_on.wait(NET_S))))  # type: ignore[func-returns-value]
+    monkeypatch.setattr(ScriptedSearch, "begin", staticmethod(lambda: (begun.set(), goes_on.wait(NET_S))))  # type: ignore[func-returns-value]
     operation = client.start_track(pixel=click(client))
     assert begun.wait(NET_S)
     assert client.pose([0.1, 0, 0], [1, 0, 0, 0])["track"]["state"] == "stopped"
@@ -294,7 +296,7 @@ def test_a_position_of_the_site_is_carried_to_the_rover(
     asked: list[Any] = []
     monkeypatch.setattr(ScriptedLoop, "script", staticmethod(lambda request, *any: asked.append(request)))
     client.wait(client.point(position_m=[2.0, 4.0, 0.5], frame="site"))
-    assert asked[0].target.position_m == pytest.approx((4.0, 0.0, 0.5))
+    assert asked[0].position_m == pytest.approx([4.0, 0.0, 0.5])
     assert client.operations()[0]["request"]["position_m"] == [2.0, 4.0, 0.5], "the record has it as it came"
 
 
@@ -308,7 +310,7 @@ def test_poses_that_come_during_a_look_make_its_pictures_worthless(
         hang()
         return found(replace(track, position_m=track.position_m + 1.0))
 
-    monkeypatch.setattr(ScriptedLooker, "script", staticmethod(slow))
+    monkeypatch.setattr(ScriptedSearch, "script", staticmethod(slow))
     first = client.pose([0.3, 0, 0], [1, 0, 0, 0], sigma=SIGMA, time_s=2.0)["operation"]
     assert hang.entered.wait(60.0)
     answer = client.pose([0.5, 0, 0], [1, 0, 0, 0], sigma=SIGMA, time_s=3.0)
@@ -316,7 +318,7 @@ def test_poses_that_come_during_a_look_make_its_pictures_worthless(
     assert answer["track"]["predicted"]
     assert answer["track"]["position_m"] == pytest.approx([4.5, 0.5, 0.0])
     refusal(lambda: drive(client, 0.6, 2.5), "pose_runs_backwards")
-    monkeypatch.setattr(ScriptedLooker, "script", staticmethod(found))
+    monkeypatch.setattr(ScriptedSearch, "script", staticmethod(found))
     hang.let_go()
     until(lambda: client.track()["looks"] == 1, "the look from the second pose")
     track = client.track()
@@ -329,18 +331,18 @@ def test_a_stop_ends_look_and_track(
 ) -> None:
     started(client)
     hang = Hang()
-    monkeypatch.setattr(ScriptedLooker, "script", staticmethod(lambda track: (hang(), found(track))[1]))  # type: ignore[func-returns-value]
+    monkeypatch.setattr(ScriptedSearch, "script", staticmethod(lambda track: (hang(), found(track))[1]))  # type: ignore[func-returns-value]
     operation = client.pose([0.5, 0, 0], [1, 0, 0, 0], sigma=SIGMA, time_s=2.0)["operation"]
     assert hang.entered.wait(60.0)
     assert client.stop()["operation"] == operation
     track = client.track()
-    assert (track["state"], track["reason"], track["operation"]) == ("stopped", "a stop was asked for", None)
+    assert (track["state"], track["reason"], track["operation"]) == ("stopped", "a stop was requested", None)
     hang.let_go()
     client.wait(operation)
     assert client.track()["state"] == "stopped"
     assert ("stop",) in pair[1].head.calls
     assert drive(client, 0.7, 3.0)["state"] == "stopped", "poses go on, the track does not"
-    assert len(ScriptedLooker.looks) == 1
+    assert len(ScriptedSearch.looks) == 1
 
 
 def test_stopping_the_track_stops_its_look_and_no_other_operation(
@@ -368,14 +370,14 @@ def test_a_device_that_fails_makes_the_target_lost_not_the_daemon(
     def fail(track: Track) -> tuple[Track, TrackSighting]:
         raise NoReply("no answer on the bus", device="pan_tilt")
 
-    monkeypatch.setattr(ScriptedLooker, "script", staticmethod(fail))
+    monkeypatch.setattr(ScriptedSearch, "script", staticmethod(fail))
     track = drive(client, 0.5, 2.0)
     assert (track["state"], track["misses"]) == ("lost", 1)
     assert track["reason"] == "pan_tilt: no answer on the bus"
     assert track["position_m"] == pytest.approx([4.5, 0.5, 0.0])
-    monkeypatch.setattr(ScriptedLooker, "script", staticmethod(found))
+    monkeypatch.setattr(ScriptedSearch, "script", staticmethod(found))
     drive(client, 0.6, 3.0)
-    assert ScriptedLooker.looks[-1].state == "lost", "both eyes must find it again"
+    assert ScriptedSearch.looks[-1].state == "lost", "both eyes must find it again"
     assert client.track()["state"] == "tracking"
 
 

@@ -25,7 +25,7 @@ from hil_tests.mastctl.service_fakes import rig
 from hil_tests.support.servo_rigs import line_alone
 from hil_tests.waiting import NET_S, present, until
 from mastctl.client import Client, ClientError
-from mastctl.safety.stop_line import ask
+from mastctl.safety.stop_line import request
 
 GOAL_RAD = 0.95
 SPEED_RAD_PER_S = 0.05  # the way takes 19 s: a stop on a busy machine still comes before its end
@@ -180,7 +180,7 @@ def test_without_a_free_descriptor_a_stop_comes_through_its_socket(bench: Bench)
         with contextlib.ExitStack() as stack:
             for _ in range(30):  # whatever is free is taken
                 stack.enter_context(contextlib.closing(connected(client.url)))
-            assert ask(bench.folder / "state" / "stop.sock", "stop")["stopped"] is True
+            assert request(bench.folder / "state" / "stop.sock", "stop")["stopped"] is True
         bench.stopped_on_the_way()
 
 
@@ -233,7 +233,7 @@ def test_with_a_full_log_pipe_stops_of_both_kinds_come_through_both_doors(bench:
         assert client.estop(name="Ana")["kept"] is True
         until(lambda: client.status()["state"] == "stopped", "the stop's end")
         client.reset(reason="looked", name="Ben")
-        assert ask(bench.folder / "state" / "stop.sock", "estop Cem: smoke")["kept"] is True
+        assert request(bench.folder / "state" / "stop.sock", "estop Cem: smoke")["kept"] is True
         assert present(client.status()["estop"])["name"] == "Cem"
     os.close(pipe.read)
     os.close(pipe.write)

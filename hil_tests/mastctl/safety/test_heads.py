@@ -105,10 +105,10 @@ def test_a_used_folder_whose_latch_file_is_gone_counts_as_latched(tmp_path: Path
         used(folder)
         (folder.path / FILE).unlink()
         latch = Latch(folder)
-        assert latch.held is not None
-        assert "is gone" in latch.held.reason
+        assert latch.entries
+        assert "is gone" in latch.entries[0].reason
         latch.release("looked", "Ben")
-        assert Latch(folder).held is None
+        assert not Latch(folder).entries
     finally:
         folder.close()
 
@@ -123,7 +123,7 @@ def test_a_head_whose_whole_folder_is_gone_is_missed_by_the_state_folder(tmp_pat
         latch.close()
         for file in head.path.iterdir():
             file.unlink()
-        assert Latch(head, state).held is not None
+        assert Latch(head, state).entries
     finally:
         state.close()
         head.close()
@@ -149,13 +149,13 @@ def test_a_latch_logs_its_causes_and_a_reset_releases_all(folder: StateFolder) -
     latch.hold("sparks", "Ana")
     for number in range(10):
         latch.hold("a stranger", f"client {number}")
-    latch.head_told()
+    latch.head_stopped()
     assert latch.kept_within(NET_S)
     causes = [("Ana", "smoke"), ("Ben", "a hand in the way"), ("Ana", "sparks")]
     causes += [(f"client {number}", "a stranger") for number in range(2)]
     assert [(one.name, one.reason) for one in Latch(folder).entries] == causes
     assert [(one.name, one.reason) for one in latch.release("aired", "Cem")] == causes
-    assert latch.held is None and Latch(folder).entries == ()
+    assert not latch.entries and Latch(folder).entries == ()
     with pytest.raises(NotNow, match="no emergency stop"):
         latch.release("aired", "Cem")
 
@@ -228,7 +228,7 @@ def test_a_latch_in_the_systems_or_in_the_users_place_blocks(
     with contextlib.closing(present(heads_module.take(name))) as place:
         latch = Latch(place)
         latch.hold("smoke", "Ana")
-        latch.head_told()
+        latch.head_stopped()
         assert latch.kept_within(NET_S)
         latch.close()
         assert place.path.is_relative_to(tmp_path / "home")
@@ -236,11 +236,11 @@ def test_a_latch_in_the_systems_or_in_the_users_place_blocks(
     with contextlib.closing(present(heads_module.take(name))) as place:
         assert place.path.is_relative_to(tmp_path / "system")
         latch = Latch(place, others=heads_module.others(name, place))
-        assert latch.held is not None and latch.held.name == "Ana"
+        assert latch.entries[0].name == "Ana"
         latch.release("aired", "Ben")
     shutil.rmtree(tmp_path / "system")
     with contextlib.closing(present(heads_module.take(name))) as place:
-        assert Latch(place).held is None
+        assert not Latch(place).entries
 
 
 def test_one_head_is_one_programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

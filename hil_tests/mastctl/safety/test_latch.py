@@ -50,19 +50,19 @@ def latched(folder: StateFolder) -> Latch:
     """A latch with a stop that the disk holds."""
     latch = Latch(folder)
     latch.hold("smoke", "Ana")
-    latch.head_told()
+    latch.head_stopped()
     assert latch.kept_within(NET_S)
     return latch
 
 
 def test_a_latched_stop_is_found_by_the_next_daemon(folder: StateFolder) -> None:
     latch = Latch(folder)
-    assert latch.held is None
+    assert not latch.entries
     held = latch.hold("sparks at the\nmast", "Ana")
-    latch.head_told()
+    latch.head_stopped()
     assert latch.kept_within(NET_S)
     assert (held.reason, held.name) == ("sparks at the mast", "Ana")
-    assert Latch(folder).held == held
+    assert Latch(folder).entries[0] == held
 
 
 def test_the_disk_waits_for_the_head_but_not_for_long(
@@ -73,7 +73,7 @@ def test_the_disk_waits_for_the_head_but_not_for_long(
     latch.hold(None, None)
     assert not latch.kept_within(0.05)
     assert "not confirmed" in latch.not_kept
-    latch.head_told()
+    latch.head_stopped()
     assert latch.kept_within(NET_S)
     monkeypatch.setattr(latch_module, "HEAD_FIRST_S", 0.05)
     latch.release("looked", "Ben")
@@ -85,9 +85,9 @@ def test_the_disk_waits_for_the_head_but_not_for_long(
 def test_a_latch_file_that_cannot_be_read_means_latched(folder: StateFolder, data: bytes) -> None:
     (folder.path / FILE).write_bytes(data)
     latch = Latch(folder)
-    assert latch.held is not None
+    assert latch.entries
     latch.release("looked at it", "Ben")
-    assert Latch(folder).held is None
+    assert not Latch(folder).entries
 
 
 def test_a_latch_that_no_disk_takes_is_in_memory_and_a_fault(
@@ -106,13 +106,13 @@ def test_a_latch_that_no_disk_takes_is_in_memory_and_a_fault(
     monkeypatch.setattr(StateFile, "write", write)
     latch = Latch(folder)
     held = latch.hold("smoke", "Ana")
-    latch.head_told()
+    latch.head_stopped()
     assert not latch.kept_within(NET_S)
-    assert latch.held == held
+    assert latch.entries[0] == held
     assert "No space left" in latch.not_kept
     full.clear()
     until(lambda: latch.not_kept == "", "the disk takes it")
-    assert Latch(folder).held == held
+    assert Latch(folder).entries[0] == held
 
 
 def refuse(file: StateFile, *ignored: Any) -> None:
@@ -129,10 +129,10 @@ def test_a_reset_that_the_disk_refuses_releases_nothing(
         for _ in range(3):
             with pytest.raises(Unable, match=r"stays latched.*No space"):
                 latch.release("aired", "Ben")
-            assert latch.held is not None
-    assert Latch(folder).held == latch.held
+            assert latch.entries
+    assert Latch(folder).entries == latch.entries
     latch.release("aired", "Ben")
-    assert Latch(folder).held is None
+    assert not Latch(folder).entries
 
 
 def test_a_stop_during_a_reset_wins(folder: StateFolder, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,8 +147,8 @@ def test_a_stop_during_a_reset_wins(folder: StateFolder, monkeypatch: pytest.Mon
     monkeypatch.setattr(StateFile, "write", write)
     with pytest.raises(NotNow, match="another emergency stop"):
         latch.release("aired", "Ben")
-    assert latch.held is not None
-    until(lambda: Latch(folder).held == latch.held, "the disk holds it again")
+    assert latch.entries
+    until(lambda: Latch(folder).entries == latch.entries, "the disk holds it again")
 
 
 @pytest.mark.parametrize("reason", ["smoke", "\U0001f525" * 200])
@@ -158,7 +158,7 @@ def test_a_power_cut_while_a_latch_is_written_reads_as_latched(folder: StateFold
     latch.release("\U0001f525" * 200, "Ben")
     old = path.read_bytes()
     latch.hold(reason, "Cem")
-    latch.head_told()
+    latch.head_stopped()
     assert latch.kept_within(NET_S)
     new = path.read_bytes()
     assert len(new) == len(old)
@@ -167,7 +167,7 @@ def test_a_power_cut_while_a_latch_is_written_reads_as_latched(folder: StateFold
     for _ in range(100):
         mixed = [new[parts[0]], *(chance.choice((old, new))[part] for part in parts[1:])]
         path.write_bytes(b"".join(mixed))
-        assert Latch(folder).held is not None
+        assert Latch(folder).entries
     path.write_bytes(b"".join([old[parts[0]], *(new[part] for part in parts[1:])]))
     Latch(folder)  # before its first sector nothing was told; it starts
 
@@ -308,8 +308,11 @@ def test_an_emergency_stop_acts_before_its_reason_has_come(
         assert present(client.wait(operation)["error"])["message"] == "an emergency stop: a hand (Ana)"
         until(lambda: b"a hand" in (tmp_path / "state" / FILE).read_bytes(), "the disk has it")
         assert daemon.service.audit.flush(NET_S)
-        recorded = (tmp_path / "state" / "audit.jsonl").read_text().splitlines()
-        assert [one["request"].get("reason") for one in map(json.loads, recorded[1:3])] == [None, "a hand"]
+        lines = map(json.loads, (tmp_path / "state" / "audit.jsonl").read_text().splitlines())
+        (estop,) = [one for one in lines if one.get("command") == "estop"]
+        assert estop["request"] == {"reason": "a hand", "name": "Ana"}
+        counted = b'mastctl_commands_total{command="estop",result="ok"} 1.0'
+        until(lambda: counted in daemon.service.metrics.text(), "one command is counted")
         with pytest.raises(Estopped, match="a hand"):
             daemon.service.devices.move(0.1, 0.1)
         client.reset(reason="the hand is away", name="Ana")
@@ -327,7 +330,7 @@ def test_a_reset_needs_a_reason_and_a_name(
         client.estop()
         answer = httpx.post(f"{daemon.url}/api/v1/reset", json=body, timeout=NET_S)
         assert (answer.status_code, present(answer.json()["error"])["code"]) == (422, "bad_request")
-        assert daemon.service.latch.held is not None
+        assert daemon.service.latch.entries
 
 
 def test_a_reset_waits_for_a_stop_that_is_under_way(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

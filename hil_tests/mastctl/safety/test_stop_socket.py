@@ -23,7 +23,7 @@ from mastctl.client import Client
 from mastctl.safety import stop_line as stop_line_module
 from mastctl.safety import stop_socket as stop_socket_module
 from mastctl.safety.state_folder import StateFolder, usual_folder
-from mastctl.safety.stop_line import NoAnswer, ask
+from mastctl.safety.stop_line import NoAnswer, request
 from mastctl.safety.stop_socket import StopSocket
 
 
@@ -33,7 +33,7 @@ class Stops:
     def __init__(self) -> None:
         self.asked: list[tuple[Any, ...]] = []
 
-    def stop_told(self) -> Any:
+    def stop_answer(self) -> Any:
         self.asked.append(("stop",))
         return {"stopped": True, "operation": None}
 
@@ -109,20 +109,20 @@ def test_a_stop_that_fails_is_told(door: StopSocket, stops: Stops, monkeypatch: 
     def refuse() -> Any:
         raise DriverError("the cable is cut")
 
-    monkeypatch.setattr(stops, "stop_told", refuse)
+    monkeypatch.setattr(stops, "stop_answer", refuse)
     assert said(door.path, b"stop\n") == "failed: the cable is cut\n"
     with pytest.raises(ValueError, match="the cable is cut"):
-        ask(door.path, "stop")
+        request(door.path, "stop")
 
 
 def test_a_stop_that_hangs_keeps_no_other_out(
     door: StopSocket, stops: Stops, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hang = Hang()
-    monkeypatch.setattr(stops, "stop_told", hang)
+    monkeypatch.setattr(stops, "stop_answer", hang)
     monkeypatch.setattr(stop_line_module, "ANSWER_S", 0.1)
     with pytest.raises(NoAnswer, match="may still move"):
-        ask(door.path, "stop")
+        request(door.path, "stop")
     assert said(door.path, b"estop Ana: sparks\n").startswith("estop {")
     hang.let_go()
 
@@ -155,7 +155,7 @@ def test_a_socket_that_a_dead_daemon_left_is_replaced(tmp_path: Path, stops: Sto
     door.close()
     until(lambda: not path.exists(), "the end")
     with pytest.raises(NoAnswer, match="no daemon listens"):
-        ask(path, "stop")
+        request(path, "stop")
 
 
 def test_a_daemon_whose_event_loop_is_blocked_takes_a_stop_here(
@@ -174,7 +174,7 @@ def test_a_daemon_whose_event_loop_is_blocked_takes_a_stop_here(
         thread = threading.Thread(target=Client(daemon.url).status)
         thread.start()
         assert hang.entered.wait(NET_S)
-        assert ask(path, "estop Ana: sparks")["latched"] is True
+        assert request(path, "estop Ana: sparks")["latched"] is True
         assert ("stop",) in hardware.head.calls
         monkeypatch.undo()
         hang.let_go()

@@ -17,8 +17,9 @@ from calib.geometry.mode import SensorMode
 from calib.geometry.rig import Mast, RigCamera
 from drivers.errors import NoReply
 from hil_tests.mastctl.service_fakes import PLAIN, FakeHardware, ScriptedLoop, rig
+from hil_tests.waiting import until
 from mastctl.daemon import RunningDaemon
-from mastctl.motion.jog import Beat
+from mastctl.motion.jog import JogBeat
 from mastctl.service import steering as steering_module
 
 
@@ -96,7 +97,8 @@ def test_the_loop_points_by_the_new_mast_file(
 
     monkeypatch.setattr(steering_module, "PointingLoop", Loop)
     web.post("/mast", json={"file": "better.yaml"})
-    assert rigs == ["better"]
+    web.post("/point", json={"pan_rad": 0.1, "tilt_rad": 0.1})
+    until(lambda: rigs == ["better"], "a pointing by the new file")
 
 
 def test_nothing_changes_while_the_head_moves(
@@ -114,7 +116,7 @@ def test_no_jog_begins_while_a_mast_file_is_changed(
     service = pair[0].service
     with ThreadPoolExecutor(1) as pool:
         with service.masts.resting():
-            jog = pool.submit(service.jogs.beat, Beat((0.1, 0.0)))
+            jog = pool.submit(service.jogs.beat, JogBeat(pan_rad_per_s=0.1, tilt_rad_per_s=0.0, sequence=1))
             with pytest.raises(TimeoutError):
                 jog.result(0.2)
             assert service.operations.running is None

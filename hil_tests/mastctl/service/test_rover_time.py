@@ -15,7 +15,7 @@ import pytest
 from drivers.errors import NoReply
 from hil_tests.waiting import present, until
 from mastctl.config import Config, Listen, load_config
-from mastctl.motion.requests import AnglesTarget, PixelTarget, PointRequest
+from mastctl.motion.requests import PixelTarget, PointRequest
 from mastctl.service.service import Service
 
 
@@ -37,7 +37,7 @@ def service_at(speed: object, **changes: Any) -> Iterator[Service]:
 
 def ended(service: Service, name: str) -> Any:
     until(lambda: service.operations.get(name).ended_s is not None, f"the end of operation {name}")
-    return service.operations.get(name).told()
+    return service.operations.get(name).as_json()
 
 
 def a_run(seed: int, pause_s: float) -> tuple[str, list[np.ndarray[Any, Any]]]:
@@ -48,7 +48,7 @@ def a_run(seed: int, pause_s: float) -> tuple[str, list[np.ndarray[Any, Any]]]:
             time.sleep(pause_s)
             frame = service.snapshot("navcam_left", fresh=True)
             pictures.append(frame.image)
-            request = PointRequest(PixelTarget("navcam_left", frame.frame_id, u_px, v_px))
+            request = PointRequest(pixel=PixelTarget("navcam_left", frame.frame_id, u_px, v_px))
             told.append(ended(service, service.steering.point(request, {"pixel": [u_px, v_px]}).id))
             time.sleep(pause_s)
         told.append(service.status())
@@ -67,7 +67,7 @@ def test_runs_of_one_seed_are_equal_to_the_last_bit() -> None:
 def test_the_head_takes_its_time_on_the_rovers_clock_only() -> None:
     with service_at("max") as service:
         began_s = service.clock.now_s()
-        told = ended(service, service.steering.point(PointRequest(AnglesTarget(2.0, -0.5)), {}).id)
+        told = ended(service, service.steering.point(PointRequest(pan_rad=2.0, tilt_rad=-0.5), {}).id)
         assert told["state"] == "done"
         assert told["steps"]
         times_s = [began_s, told["created_s"], told["started_s"]]
@@ -95,7 +95,7 @@ def test_a_deadline_is_one_of_the_rovers_time() -> None:
 def test_a_stop_overtakes_a_move_that_nobody_waits_for() -> None:
     with service_at("max") as service:
         with service.clock.at_work():  # no time passes but what is slept here: the head is under way
-            moving = service.steering.point(PointRequest(AnglesTarget(2.5, 0.0)), {}).id
+            moving = service.steering.point(PointRequest(pan_rad=2.5, tilt_rad=0.0), {}).id
             service.clock.sleep(1.0)
             service.stopping.stop()
         told = ended(service, moving)

@@ -152,9 +152,9 @@ def test_a_fifth_stop_is_answered_honestly_while_four_hang(
 class PatientLoop(PointingLoop):
     """A loop that would wait for a picture longer than any net."""
 
-    def __init__(self, *given: Any) -> None:
-        super().__init__(*given)
-        self._settings = replace(self._settings, frame_timeout_s=2.0 * NET_S)
+    def __init__(self, rig: Any, devices: Any, limits: Any, clock: Any, settings: Any, *rest: Any) -> None:
+        settings = replace(settings, frame_timeout_s=2.0 * NET_S)
+        super().__init__(rig, devices, limits, clock, settings, *rest)
 
 
 def waiting_pointing(client: Client, hardware: FakeHardware, hang: Hang) -> str:
@@ -177,7 +177,7 @@ def test_a_stop_ends_a_pointing_that_waits_for_a_picture(
         operation = waiting_pointing(client, hardware, hang)
         client.stop()
         until(lambda: client.operation(operation)["state"] == "stopped", "the end")
-        assert present(client.operation(operation)["error"])["message"] == "a stop was asked for"
+        assert present(client.operation(operation)["error"])["message"] == "a stop was requested"
         assert client.status()["state"] == "holding"
         assert client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))["state"] == "done"
         hang.let_go()

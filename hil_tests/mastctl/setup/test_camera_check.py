@@ -75,7 +75,7 @@ def test_a_camera_that_keeps_its_promises_has_no_problem() -> None:
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        ("old", "was exposed 0.300 s before the asked moment"),
+        ("old", "was exposed 0.300 s before the requested moment"),
         ("old", "asked for a frame exposed in 60 s, within 0.2 s, it gave one that was exposed before"),
         ("count", "count and time must grow together"),
         ("future", "stamped to end 0.200 s in the future"),

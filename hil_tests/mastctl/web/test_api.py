@@ -113,11 +113,11 @@ def test_the_request_reaches_the_loop_as_it_was_made(
     ):
         ended(web, web.post("/point", json=body).json()["id"])
     clicked, placed, turned = requests
-    assert (clicked.target.camera, clicked.target.frame_id) == ("navcam_left", frame_id)
-    assert (clicked.target.x_px, clicked.target.y_px, clicked.pointings) == (12.5, 7.0, 2)
+    assert (clicked.pixel.camera, clicked.pixel.frame_id) == ("navcam_left", frame_id)
+    assert (clicked.pixel.x_px, clicked.pixel.y_px, clicked.pointings) == (12.5, 7.0, 2)
     assert (clicked.aim.camera, clicked.aim.x_px, clicked.aim.y_px) == ("navcam_right", 1.0, 2.0)
-    assert (tuple(placed.target.position_m), placed.target.frame) == ((1.0, 2.0, 3.0), "site")
-    assert (turned.target.pan_rad, turned.target.tilt_rad, turned.aim) == (0.1, -0.1, None)
+    assert (placed.position_m, placed.frame) == ([1.0, 2.0, 3.0], "site")
+    assert (turned.angles_rad, turned.aim) == ((0.1, -0.1), None)
 
 
 P = {"camera": "navcam_left", "frame_id": "f", "x_px": 1.0, "y_px": 2.0}

@@ -19,7 +19,7 @@ from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped
 from mastctl.safety.latch import MOST
-from mastctl.safety.stop_line import ask
+from mastctl.safety.stop_line import request
 
 ANGLES: dict[str, Any] = {"pan_rad": 0.1, "tilt_rad": -0.1}
 Pair = tuple[RunningDaemon, FakeHardware]
@@ -139,8 +139,8 @@ def test_a_head_under_way_into_what_comes_to_be_kept_out_is_stopped(
     until(lambda: web.get(f"/operations/{name}").json()["state"] == "running", "it runs")
     assert web.post(path, json=body).status_code == 200
     assert web.get(f"/operations/{name}").json()["state"] == "running"
-    door = pair[0].service.devices.door
-    monkeypatch.setattr(door, "in_the_way", lambda reading: "sun")
+    judge = pair[0].service.devices.judge
+    monkeypatch.setattr(judge, "in_the_way", lambda reading: "sun")
     assert web.post(path, json=body).status_code == 200
     until(lambda: web.get(f"/operations/{name}").json()["state"] == "stopped", "it is stopped")
     assert "keep-out sun" in web.get(f"/operations/{name}").json()["error"]["message"]
@@ -280,8 +280,8 @@ def test_stops_over_http_and_over_their_own_socket_leave_their_lines(
     service.open_stop_socket()
     path = service.folder.path / "audit.jsonl"
     assert service.stop_socket is not None
-    assert ask(service.stop_socket.path, "stop")["stopped"]
-    assert ask(service.stop_socket.path, "estop rover: smoke")["latched"]
+    assert request(service.stop_socket.path, "stop")["stopped"]
+    assert request(service.stop_socket.path, "estop rover: smoke")["latched"]
     bench.reset(reason="no fire", name="bench")
     bench.estop(reason="smoke again", name="bench")
     assert service.audit.flush(NET_S)

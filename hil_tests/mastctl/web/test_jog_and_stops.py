@@ -13,7 +13,7 @@ from mastctl.client import Client, ClientError
 from mastctl.client.jog import Jog
 from mastctl.daemon import RunningDaemon
 from mastctl.motion import jog as jog_module
-from mastctl.safety.stop_line import ask
+from mastctl.safety.stop_line import request
 
 RATES = {"pan_rad_per_s": 0.2, "tilt_rad_per_s": 0.0}
 Pair = tuple[RunningDaemon, FakeHardware]
@@ -38,9 +38,9 @@ def is_refused(jog: Jog) -> bool:
     return False
 
 
-def beat(web: httpx.Client) -> str:
-    """Send a heartbeat; return why it was refused, or ``''``."""
-    answer = web.post("/jog", json=RATES)
+def beat(web: httpx.Client, number: int) -> str:
+    """Send a heartbeat without an id; return why it was refused, or ``''``."""
+    answer = web.post("/jog", json={**RATES, "sequence": number})
     return "" if answer.status_code == 200 else str(answer.json()["error"]["code"])
 
 
@@ -51,12 +51,12 @@ def test_a_stop_by_its_socket_ends_a_jog_though_nameless_heartbeats_go_on(
     socket = pair[0].service.stop_socket
     assert socket is not None
     before = moves(pair[1])
-    assert beat(web) == ""
+    assert beat(web, 1) == ""
     until(lambda: moves(pair[1]) > before, "the jog's first goal")
-    assert ask(socket.path, "stop")["stopped"]
+    assert request(socket.path, "stop")["stopped"]
     before = moves(pair[1])
-    for _ in range(4):
-        assert beat(web) in ("jog_ended", "stopping")
+    for number in range(2, 6):
+        assert beat(web, number) in ("jog_ended", "stopping")
     assert moves(pair[1]) == before, "a heartbeat of the jog that was stopped moved the head"
 
 

@@ -190,7 +190,7 @@ def head_under_test(
     known = own_limits_rad is not None or bounds.stored is not None
     with head_beside(settings, bounds, SystemClock(), moves=moves) as opened:
         head = opened()
-        counts_rad = head.door.counts_rad.values()
+        counts_rad = head.judge.counts_rad.values()
         count_rad = max(counts_rad) if len(counts_rad) == 2 else None
         again = not is_hardware("simulated", "head", settings.pan_tilt.driver)
         trial = HeadTrial(
@@ -206,7 +206,7 @@ def head_under_test(
         except (PromiseBroken, SubjectLost, DriverError) as reason:  # the tests have to report it
             trial.unplaced = f"its present pose is not known: {reason}"
         else:
-            free = head.door.room(at(first))
+            free = head.judge.room(at(first))
             if free is None:
                 trial.unplaced = "it is in a keep-out, or too near to one"
             else:

@@ -105,13 +105,14 @@ export class Jog {
         const told = await beat(body);
         this.id = told.id;
         say(this.held, inDegrees(Object.values(told.held ?? {}).join(" ")));
-        if (still) { this.id = null; continue; }
+        if (still) { this.id = null; this.sequence = 0; continue; }
         if (rates === this.rates) {
           await new Promise((go) => { this.wake = go; setTimeout(go, BEAT_MS); });
         }
       }
     } catch (error) {
       this.id = null;
+      this.sequence = 0;
       this.down.clear();
       this.rates = [0, 0];
       for (const button of this.pad.children) button.dataset.held = false;

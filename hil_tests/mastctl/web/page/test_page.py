@@ -23,27 +23,30 @@ from hil_tests.mastctl.service_fakes import (
 from hil_tests.mastctl.web.network import network_daemon
 from hil_tests.mastctl.web.page.conftest import Visit
 from hil_tests.waiting import NET_S, until
+from mastctl.as_json import as_json
 from mastctl.client import Client
 from mastctl.control.caller import Caller
 from mastctl.daemon import RunningDaemon
-from mastctl.motion.requests import Aim
-from mastctl.motion.results import Preview
 from mastctl.web.page import page_files
 
 BOTH = tuple[RunningDaemon, FakeHardware]
 Visits = Callable[..., Visit]
-SEEN = Preview(
-    camera="navcam_left", frame_id="a", pixel_px=(32.0, 24.0), position_m=(6.0, 0.5, 0.1), range_m=6.02,
-    range_from="stereo", aim=Aim("navcam_left", 31.5, 23.5), goal_rad=(0.1, -0.1), refused=None,
-    other_camera="navcam_right", other_frame_id="b", other_pixel_px=(30.0, 24.0), other_sigma_px=(0.05, 0.05),
-    correlation=0.97, second=0.4, across_px=0.02, sigma_m=(0.03, 0.01, 0.01), range_sigma_m=0.031,
+SEEN = as_json(
+    {
+        "camera": "navcam_left", "frame_id": "a", "pixel_px": (32.0, 24.0), "position_m": (6.0, 0.5, 0.1),
+        "range_m": 6.02, "range_from": "stereo", "range_interval_m": None, "goal_rad": (0.1, -0.1),
+        "aim": {"camera": "navcam_left", "x_px": 31.5, "y_px": 23.5}, "refused": None,
+        "other_camera": "navcam_right", "other_frame_id": "b", "other_pixel_px": (30.0, 24.0),
+        "other_sigma_px": (0.05, 0.05), "correlation": 0.97, "second": 0.4, "across_px": 0.02,
+        "sigma_m": (0.03, 0.01, 0.01), "range_sigma_m": 0.031,
+    }
 )  # fmt: skip
 
 
 class Previewing(ScriptedLoop):
     """A scripted loop that sees what is clicked."""
 
-    def preview(self, request: Any, cancelled: Any) -> Preview:
+    def preview(self, request: Any) -> Any:
         return SEEN
 
 

@@ -44,7 +44,7 @@ def test_a_rock_is_clicked_pointed_at_and_its_residual_read(rover: RunningDaemon
     words = one.target("ended")
     figures = re.findall(r"[xy] ([+−]?\d+\.\d{3}) ± (\d\.\d{3}) px", words)
     assert len(figures) == 2, words
-    record: Any = rover.service.operations.all()[0].told()
+    record: Any = rover.service.operations.all()[0].as_json()
     for (told, sigma), value, expected in zip(
         figures, record["residual_px"], record["residual_sigma_px"], strict=True
     ):
@@ -61,7 +61,7 @@ def test_a_rock_is_clicked_pointed_at_and_its_residual_read(rover: RunningDaemon
         one.page.locator("#again").click()
         until(lambda: len(rover.service.operations.all()) == 2, "a second pointing was begun")
         one.target("ended")
-        again = rover.service.operations.all()[0].told()
+        again = rover.service.operations.all()[0].as_json()
         assert again["state"] == "done"
         assert again["request"]["pixel"] == asked, "the target is what was clicked first"
         one.page.wait_for_selector("#truly")

@@ -1,12 +1,12 @@
-"""New pictures and what they show: frames of a resting head, the clicked thing found again in them."""
+"""New images and what they show: frames of a resting head, the clicked thing found again in them."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -19,22 +19,15 @@ from calib.matching.patch import match_patch
 from calib.matching.sweep import UP
 from calib.matching.verdict import MatchSettings, PatchMatch
 from calib.matching.warp import Plane, PosedImage, Relief, carry, facing_plane, grey
+from drivers.errors import DriverError
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
+from mastctl.motion.head import DevicesLike
 from mastctl.motion.results import PointingError, rounded
 from mastctl.motion.settings import PointingSettings
 
 BESIDE = "; try a pixel beside it"
 """To a person who clicked: at a rim or on bare ground a neighbour may match."""
-
-
-class FramesLike(Protocol):
-    """What of `mastctl.devices.devices.Devices` brings pictures."""
-
-    def frames(
-        self, cameras: Sequence[str], exposed_after_s: float, timeout_s: float
-    ) -> dict[str, StampedFrame]: ...
-    def newest_frames(self) -> dict[str, StampedFrame | None]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +41,8 @@ class CameraView(PosedImage):
 class Clicked:
     """The thing that was clicked: where in which view, and the surface around it in the rover frame.
 
-    ``relief``: what stands off that plane, if two eyes saw it. ``others``: where else the surface may be, if
-    its range is not known.
+    ``relief``: what stands off that plane, if two cameras saw it. ``others``: where else the surface may be,
+    if its range is not known.
     """
 
     view: CameraView
@@ -60,15 +53,25 @@ class Clicked:
 
 
 class RigCameras:
-    """The cameras during one request; all geometry by the mast file and the true joint angles measured."""
+    """The cameras during one request; all geometry by the mast file and the true joint angles measured.
 
-    def __init__(self, cameras: FramesLike, rig: Rig, settings: PointingSettings) -> None:
-        self._cameras = cameras
+    ``check`` is called while images are waited for, and ends the wait by raising.
+    """
+
+    def __init__(
+        self,
+        devices: DevicesLike,
+        rig: Rig,
+        settings: PointingSettings,
+        check: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.settings = settings
+        self._devices = devices
         self._rig = rig
-        self._settings = settings
+        self._check = check
 
     def partner(self, camera: str) -> str | None:
-        """Return the other eye of a camera's stereo pair, None if it has none."""
+        """Return the other camera of a camera's stereo pair, None if it has none."""
         for left, right in self._rig.stereo.values():
             if camera in (left, right):
                 return right if camera == left else left
@@ -77,10 +80,10 @@ class RigCameras:
     def companions(
         self, aiming: str, clicked: str, position_m: FloatArray, resting: HeadReading
     ) -> tuple[str, ...]:
-        """Return the eyes that can confirm what the aiming one will see: its partner where that sees it too.
+        """Return the cameras that can confirm what the aiming one will see: its partner where that sees it.
 
-        A near target in the middle of one eye may be out of the other's picture (a Pancam at 2 m); then
-        both eyes of another pair on the head serve, the clicked pair first. Empty if none sees it.
+        A near target in the middle of one camera may be out of the other's image (a Pancam at 2 m); then
+        both cameras of another pair on the head serve, the clicked pair first. Empty if none sees it.
         """
         partner = self.partner(aiming)
         if partner is not None and self._sees(partner, position_m, resting):
@@ -96,89 +99,102 @@ class RigCameras:
     ) -> dict[str, CameraView]:
         """Return frames exposed after a moment, by a head that rests where it was read.
 
-        Waited for is as long as the settings say, or ``timeout_s``.
+        ``timeout_s`` is that of the settings by default.
 
-        Raises
-        ------
-        PointingError
-            ``head_moving`` if the head moved in an exposure or is not where it rested.
-        DriverError
-            If a frame does not come, or cannot be used.
+        Raises PointingError ``head_moving`` if the head moved in an exposure or is not where it rested;
+        DriverError if a frame does not come, or cannot be used.
         """
         views = {}
-        timeout_s = self._settings.frame_timeout_s if timeout_s is None else timeout_s
-        for name, frame in self._cameras.frames(names, after_s, timeout_s).items():
+        timeout_s = self.settings.frame_timeout_s if timeout_s is None else timeout_s
+        for name, frame in self._devices.frames(names, after_s, timeout_s, self._check).items():
             if frame.exposure_began_s < after_s:
                 early_s = after_s - frame.exposure_began_s
                 raise PointingError(
                     "no_fresh_frame", f"an image of {name} was exposed {early_s:.3f} s too early"
                 )
             apart = max(abs(frame.pan_rad - resting.pan_rad), abs(frame.tilt_rad - resting.tilt_rad))
-            if frame.moving or not apart <= self._settings.rest_tolerance_rad:
-                words = f"the head moved while an image of {name} was exposed ({apart:.4f} rad off its rest)"
-                raise PointingError("head_moving", words)
+            if frame.moving or not apart <= self.settings.rest_tolerance_rad:
+                where = f"an image of {name} was exposed ({apart:.4f} rad off its rest)"
+                raise PointingError("head_moving", f"the head moved while {where}")
             views[name] = self.view(frame)
         return views
+
+    def some(
+        self,
+        names: Sequence[str],
+        after_s: float,
+        resting: HeadReading,
+        needed: Sequence[str] = (),
+        timeout_s: float | None = None,
+    ) -> tuple[dict[str, CameraView], dict[str, str]]:
+        """Return frames as `new` of those cameras that give one, and why another gives none.
+
+        Raises what `new` does of a camera that is ``needed``, and of the head.
+        """
+        missing: dict[str, str] = {}
+        while left := [name for name in names if name not in missing]:
+            try:
+                return self.new(left, after_s, resting, timeout_s), missing
+            except DriverError as error:
+                if error.device not in left or error.device in needed:
+                    raise
+                missing[error.device] = " ".join(str(error).split())
+        return {}, missing
 
     def again(self, view: CameraView, pixel_px: FloatArray, now: CameraView) -> PatchMatch:
         """Find a clicked pixel in a new frame of the same camera, before its range is known.
 
-        Raises
-        ------
-        PointingError
-            ``not_in_view`` if the head has turned away since, ``target_...`` if the match is not good.
+        Raises PointingError ``not_in_view`` if the head has turned away since, ``target_...`` if the match is
+        not good.
         """
-        settings = self._settings
-        here = max(abs(view.frame.pan_rad - now.frame.pan_rad), abs(view.frame.tilt_rad - now.frame.tilt_rad))
+        settings = self.settings
+        turned = max(
+            abs(view.frame.pan_rad - now.frame.pan_rad), abs(view.frame.tilt_rad - now.frame.tilt_rad)
+        )
         planes = [_plane_at(view.camera, pixel_px, range_m) for range_m in (1.0, 2.0, 1e3)]
-        if here <= settings.same_pose_rad:
+        if turned <= settings.same_pose_rad:
             return _good(match_patch(view, pixel_px, planes[1], now, 12.0, settings.match), now)
         places = np.array([carry(pixel_px, view.camera, plane, now.camera)[0] for plane in planes])
         size = np.array(now.camera.size_px)
         if not np.isfinite(places).all() or (places[1] < 0).any() or (places[1] > size - 1).any():
             raise PointingError(
                 "not_in_view",
-                f"the head has turned by {here:.3f} rad since the clicked image of {view.frame.camera}: "
+                f"the head has turned by {turned:.3f} rad since the clicked image of {view.frame.camera}: "
                 "the pixel is out of view, click in a new image",
             )
         spread = float(np.ptp(places, axis=0).max())
         search = min(settings.wide_search_px, settings.search_px / 2 + spread)
-        found = [
+        matches = [
             match_patch(view, pixel_px, plane, now, search, settings.match)
             for plane in (planes[1], Plane(planes[1].point_m, UP))
         ]
-        return _good(_best(found), now)
+        return _good(_best(matches), now)
 
     def stereo(self, view: CameraView, pixel_px: FloatArray, other: CameraView) -> StereoMatch:
-        """Find the other eye's pixel along the epipolar line.
+        """Find the other camera's pixel along the epipolar line.
 
-        Raises
-        ------
-        PointingError
-            ``target_...`` if the match is not good, ``eyes_disagree`` if it lies off the line.
+        Raises PointingError ``target_...`` if the match is not good, ``eyes_disagree`` if it lies off the
+        line.
         """
-        settings = self._settings
+        settings = self.settings
         found = find_partner(view, pixel_px, other, settings.nearest_m, settings.match)
         if found.match.verdict in ("weak", "ambiguous", "flat"):
             raise _refusal(found.match, other, BESIDE)
         _good(found.match, other)
-        if abs(found.across_px) > settings.eyes_px + 5.0 * found.across_sigma_px:
+        if abs(found.across_px) > settings.across_px + 5.0 * found.across_sigma_px:
             raise PointingError(
                 "eyes_disagree",
                 f"{other.frame.camera} sees the target {found.across_px:+.2f} px off the line on which "
-                f"{view.frame.camera} puts it, at most {settings.eyes_px:g} px is expected{BESIDE}",
+                f"{view.frame.camera} puts it, at most {settings.across_px:g} px is expected{BESIDE}",
             )
         return found
 
     def look_for(self, clicked: Clicked, now: CameraView) -> PatchMatch:
         """Find the clicked thing in a new view: near where it should be, then further around.
 
-        Raises
-        ------
-        PointingError
-            ``target_...`` if no match is good.
+        Raises PointingError ``target_...`` if no match is good.
         """
-        settings = self._settings
+        settings = self.settings
         planes = [clicked.plane, *clicked.others]
         ray = clicked.view.camera.ray(clicked.pixel_px)
         if abs(float(ray.directions @ clicked.plane.normal)) < 0.97:
@@ -197,22 +213,19 @@ class RigCameras:
     def agree(
         self, clicked: Clicked, now: CameraView, seen: PatchMatch, other: CameraView, same_pair: bool
     ) -> tuple[PatchMatch, dict[str, Any]]:
-        """Find the clicked thing in the other eye too and check that both mean the same place.
+        """Find the clicked thing in the other camera too and check that both mean the same place.
 
-        One eye alone would believe a shifted picture. Compared is the place in the other eye with where
-        the first eye's ray leads there; a wrong joint angle turns both eyes alike and does not show.
+        One camera alone would accept a shifted image. Compared is the place in the other one with where the
+        first one's ray leads there; a wrong joint angle turns both alike and does not show.
 
         Returns
         -------
         match, detail
-            In the other eye, and the difference across and along the epipolar line.
+            In the other camera, and the difference across and along the epipolar line.
 
-        Raises
-        ------
-        PointingError
-            ``eyes_disagree`` if the other eye does not confirm the place.
+        Raises PointingError ``eyes_disagree`` if the other camera does not confirm the place.
         """
-        settings = self._settings
+        settings = self.settings
         try:
             confirmed = self.look_for(clicked, other)
         except PointingError as error:
@@ -220,13 +233,13 @@ class RigCameras:
                 "eyes_disagree",
                 f"{now.frame.camera} finds the target, {other.frame.camera} does not confirm it: {error}",
             ) from None
-        # The place as the first eye sees it, at the range that is believed, and two per cent farther.
+        # The place as the first camera sees it, at the range that is assumed, and two per cent farther.
         ray = now.camera.ray(seen.pixel_px)
         range_m = float(np.linalg.norm(clicked.plane.point_m - ray.origins_m))
-        believed, farther = other.camera.project(
+        assumed, farther = other.camera.project(
             ray.origins_m + range_m * np.array([[1.0], [1.02]]) * ray.directions
         )[0]
-        between, along = confirmed.pixel_px - believed, farther - believed
+        between, along = confirmed.pixel_px - assumed, farther - assumed
         along /= max(float(np.linalg.norm(along)), 1e-12)
         along_px, across_px = float(between @ along), float(along[0] * between[1] - along[1] * between[0])
         detail = {
@@ -235,29 +248,30 @@ class RigCameras:
             "across_px": round(across_px, 3),
             "along_px": round(along_px, 3),
         }
-        if abs(across_px) > settings.eyes_px or (same_pair and abs(along_px) > settings.range_px):
+        if abs(across_px) > settings.across_px or (same_pair and abs(along_px) > settings.range_px):
             raise PointingError(
                 "eyes_disagree",
                 f"{now.frame.camera} and {other.frame.camera} put the target {across_px:+.2f} px across and "
-                f"{along_px:+.2f} px along the epipolar line apart, at most {settings.eyes_px:g} px across "
+                f"{along_px:+.2f} px along the epipolar line apart, at most {settings.across_px:g} px across "
                 f"and {settings.range_px:g} px along is expected",
             )
         return confirmed, detail
 
     def _sees(self, name: str, position_m: FloatArray, resting: HeadReading) -> bool:
-        """Tell whether a configured camera has a position well inside its picture."""
-        if name not in self._cameras.newest_frames():
+        """Tell whether a configured camera has a position well inside its image."""
+        if name not in self._devices.newest_frames():
             return False
         camera = self._rig.camera_in_rover(name, *resting.true_rad)
         place, valid = camera.project(position_m)
-        return bool(valid) and camera.holds(place, 2.0 * self._settings.match.half_px)
+        return bool(valid) and camera.holds(place, 2.0 * self.settings.match.half_px)
 
     def _sizes(self) -> tuple[MatchSettings, MatchSettings]:
         """Return the matching with the usual patch, and with one that may fit beside an edge."""
-        usual = self._settings.match
-        return usual, replace(usual, half_px=self._settings.small_half_px)
+        usual = self.settings.match
+        return usual, replace(usual, half_px=self.settings.small_half_px)
 
     def view(self, frame: StampedFrame) -> CameraView:
+        """Return a frame with its camera. Raises PointingError ``bad_reading``."""
         if not all(map(math.isfinite, (frame.pan_rad, frame.tilt_rad, *frame.true_rad))):
             raise PointingError("bad_reading", f"frame {frame.frame_id} has no finite joint angles")
         camera = self._rig.camera_in_rover(frame.camera, *frame.true_rad)

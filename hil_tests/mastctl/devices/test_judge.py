@@ -1,4 +1,4 @@
-"""The door: limits and keep-outs of the moment, judged from where the head may be when the move goes out."""
+"""The judge: limits and keep-outs of the moment, judged from where the head may be when the move goes out."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class StatedHead(FakeHead):
         return HeadInfo(motion=dict.fromkeys(("pan", "tilt"), AxisMotion(ACCELERATION, self.beyond_rad)))
 
 
-def door_of(
+def judge_of(
     limits: Limits = LIMITS,
     head: FakeHead | None = None,
     sun: SunDirection | None = None,
@@ -48,9 +48,9 @@ def at(pan_rad: float, tilt_rad: float, moving: bool = False) -> Reading:
     return Reading(pan_rad, tilt_rad, moving, 100.0)
 
 
-def lets(door: KeepOutJudge, reading: Reading, goal: Pair) -> bool:
+def lets(judge: KeepOutJudge, reading: Reading, goal: Pair) -> bool:
     try:
-        door.check_move(goal, lambda: reading)
+        judge.check_move(goal, lambda: reading)
     except KeptOut:
         return False
     return True
@@ -104,111 +104,111 @@ def test_the_head_is_read_again_before_a_move_near_a_keep_out(
 
 
 def test_no_head_is_read_for_a_move_where_nothing_is_kept_out() -> None:
-    door = door_of(replace(LIMITS, keep_out=()))
+    judge = judge_of(replace(LIMITS, keep_out=()))
 
     def read() -> Reading:
         raise AssertionError("read")
 
-    assert door.check_move((0.0, -1.0), read) is None
+    assert judge.check_move((0.0, -1.0), read) is None
 
 
 def test_a_moving_heads_place_counts_braking_and_travel() -> None:
-    door = door_of()
+    judge = judge_of()
     far = BRAKING_RAD + 0.5 * TRAVEL_S
     edge = -0.8 + far  # from here it may brake just above the deck
-    assert lets(door, at(0.0, edge + 0.001, moving=True), (0.5, 0.0))
-    assert not lets(door, at(0.0, edge - 0.021, moving=True), (0.5, 0.0)), "it may be in the deck"
-    assert lets(door, at(0.0, edge - 0.021), (0.5, 0.0)), "at rest it stands where it was read"
+    assert lets(judge, at(0.0, edge + 0.001, moving=True), (0.5, 0.0))
+    assert not lets(judge, at(0.0, edge - 0.021, moving=True), (0.5, 0.0)), "it may be in the deck"
+    assert lets(judge, at(0.0, edge - 0.021), (0.5, 0.0)), "at rest it stands where it was read"
 
 
 def test_a_moving_head_is_assumed_in_the_rectangle_passed_last() -> None:
-    door = door_of()
-    start = door.check_move((1.5, -0.5), lambda: at(0.0, -0.5))
-    door.sent(start, (1.5, -0.5), 0.5)
+    judge = judge_of()
+    start = judge.check_move((1.5, -0.5), lambda: at(0.0, -0.5))
+    judge.sent(start, (1.5, -0.5), 0.5)
     near_the_deck = at(0.7, -0.76, moving=True)  # lower than the rectangle: it brakes there at most
-    assert not lets(door, near_the_deck, (0.7, -0.78))
+    assert not lets(judge, near_the_deck, (0.7, -0.78))
     inside = at(0.7, -0.5, moving=True)
-    assert lets(door, inside, (0.7, -0.78)), "tilt rests: it cannot be on its way down"
-    assert not lets(door, inside, (0.0, -0.79)), "that is the margin"
+    assert lets(judge, inside, (0.7, -0.78)), "tilt rests: it cannot be on its way down"
+    assert not lets(judge, inside, (0.0, -0.79)), "that is the margin"
 
 
 def test_a_head_at_rest_right_after_a_move_is_not_believed() -> None:
-    door = door_of()
-    start = door.check_move((1.5, -1.0), lambda: at(1.5, -0.4))
-    door.sent(start, (1.5, -1.0), 0.5)
-    assert not lets(door, at(1.5, -0.4), (0.0, -0.4)), "it may be on its way down beside the deck"
+    judge = judge_of()
+    start = judge.check_move((1.5, -1.0), lambda: at(1.5, -0.4))
+    judge.sent(start, (1.5, -1.0), 0.5)
+    assert not lets(judge, at(1.5, -0.4), (0.0, -0.4)), "it may be on its way down beside the deck"
 
 
 def test_an_approach_from_one_side_is_part_of_the_slack() -> None:
     head = StatedHead()
     head.beyond_rad = 0.1
-    door = door_of(head=head)
-    assert not lets(door, at(0.0, 0.0), (0.0, -0.75))
-    assert lets(door, at(0.0, 0.0), (0.0, -0.67))
+    judge = judge_of(head=head)
+    assert not lets(judge, at(0.0, 0.0), (0.0, -0.75))
+    assert lets(judge, at(0.0, 0.0), (0.0, -0.67))
 
 
 def test_a_head_faster_than_the_limit_is_refused_with_the_option() -> None:
     slow = replace(LIMITS, acceleration_rad_per_s2=1.0)
     words = r"limits.acceleration_rad_per_s2 is 1, and pan speeds up with 2 .* set acceleration_rad_per_s2 of"
     with pytest.raises(BadOptions, match=words):
-        door_of(slow)
-    door_of(replace(LIMITS, acceleration_rad_per_s2=2.0))
+        judge_of(slow)
+    judge_of(replace(LIMITS, acceleration_rad_per_s2=2.0))
 
 
 def test_the_sun_is_kept_out_until_its_moment_and_then_missed_aloud() -> None:
     clock = ManualClock(100.0)
-    door = door_of(replace(LIMITS, keep_out=()), clock=clock)
-    door.use_sun(SunDirection(direction_of(0.5, 0.0), "rover", 0.1, 110.0))
+    judge = judge_of(replace(LIMITS, keep_out=()), clock=clock)
+    judge.use_sun(SunDirection(direction_of(0.5, 0.0), "rover", 0.1, 110.0))
     with pytest.raises(KeptOut, match="keep-out sun"):
-        door.check_goal(0.5, 0.0)
-    assert [fault.code for fault in door.faults(at(0.5, 0.02))] == ["sun_in_view"]
-    assert door.faults(at(0.5, 0.5)) == ()
-    told = present(door.told()["sun"])
+        judge.check_goal(0.5, 0.0)
+    assert [fault.code for fault in judge.faults(at(0.5, 0.02))] == ["sun_in_view"]
+    assert judge.faults(at(0.5, 0.5)) == ()
+    told = present(judge.sun_as_json()["sun"])
     assert (told["left_s"], told["active"]) == (10.0, True)
     clock.advance(10.5)
-    door.check_goal(0.5, 0.0)
-    assert [fault.code for fault in door.faults(at(0.5, 0.02))] == ["sun_not_known"]
-    door.use_sun(None)
-    assert door.faults(at(0.5, 0.02)) == () and door.told() == {"sun": None, "boxes": []}
+    judge.check_goal(0.5, 0.0)
+    assert [fault.code for fault in judge.faults(at(0.5, 0.02))] == ["sun_not_known"]
+    judge.use_sun(None)
+    assert judge.faults(at(0.5, 0.02)) == () and judge.sun_as_json() == {"sun": None, "boxes": []}
 
 
 def test_a_new_sun_is_found_ahead_of_a_head_and_not_behind_it() -> None:
     clock = ManualClock(100.0)
-    door = door_of(replace(LIMITS, keep_out=()), clock=clock)
-    door.use_sun(SunDirection(direction_of(2.4, 0.5), "rover", 0.1))  # somewhere else
-    start = door.check_move((1.0, 0.0), lambda: at(-1.0, 0.0))
-    door.sent(start, (1.0, 0.0), 0.5)
-    assert door.in_the_way(at(-0.8, 0.0, moving=True)) is None
-    door.use_sun(SunDirection(direction_of(0.0, 0.0), "rover", 0.1))
-    assert door.in_the_way(at(-0.8, 0.0, moving=True)) == "sun"
-    assert door.in_the_way(at(0.0, 0.0, moving=True)) is None  # it looks there and goes out
-    assert door.in_the_way(at(0.8, 0.0, moving=True)) is None  # it has passed
-    door.use_sun(SunDirection(direction_of(1.0, 0.0), "rover", 0.1))
-    assert door.in_the_way(at(0.95, 0.0, moving=True)) == "sun"  # it would come to rest there
+    judge = judge_of(replace(LIMITS, keep_out=()), clock=clock)
+    judge.use_sun(SunDirection(direction_of(2.4, 0.5), "rover", 0.1))  # somewhere else
+    start = judge.check_move((1.0, 0.0), lambda: at(-1.0, 0.0))
+    judge.sent(start, (1.0, 0.0), 0.5)
+    assert judge.in_the_way(at(-0.8, 0.0, moving=True)) is None
+    judge.use_sun(SunDirection(direction_of(0.0, 0.0), "rover", 0.1))
+    assert judge.in_the_way(at(-0.8, 0.0, moving=True)) == "sun"
+    assert judge.in_the_way(at(0.0, 0.0, moving=True)) is None  # it looks there and goes out
+    assert judge.in_the_way(at(0.8, 0.0, moving=True)) is None  # it has passed
+    judge.use_sun(SunDirection(direction_of(1.0, 0.0), "rover", 0.1))
+    assert judge.in_the_way(at(0.95, 0.0, moving=True)) == "sun"  # it would come to rest there
     clock.advance(1.0)
-    assert door.in_the_way(at(1.0, 0.0)) is None  # it rests; nothing is to be stopped
-    assert door.in_the_way(None) is None
+    assert judge.in_the_way(at(1.0, 0.0)) is None  # it rests; nothing is to be stopped
+    assert judge.in_the_way(None) is None
 
 
 def test_a_sun_of_the_site_turns_with_the_rover() -> None:
     sun = SunDirection(direction_of(0.5, 0.0), "site", 0.1)
-    door = door_of(replace(LIMITS, keep_out=()), sun=sun)
+    judge = judge_of(replace(LIMITS, keep_out=()), sun=sun)
     with pytest.raises(KeptOut):
-        door.check_goal(0.5, 0.0)
+        judge.check_goal(0.5, 0.0)
     heading = 0.9  # the rover turned right: what was ahead to the right is now to the left
     cosine, sine = math.cos(heading), math.sin(heading)
-    door.rover_stands(np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]))
-    door.check_goal(0.5, 0.0)
+    judge.rover_stands(np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]]))
+    judge.check_goal(0.5, 0.0)
     with pytest.raises(KeptOut):
-        door.check_goal(0.5 - heading, 0.0)
+        judge.check_goal(0.5 - heading, 0.0)
 
 
 def test_a_head_in_a_keep_out_is_told_since_it_was_first_read_there() -> None:
-    door = door_of()
+    judge = judge_of()
     clear, inside = at(0.0, 0.0), at(0.0, -0.9)
 
     def since(time_s: float, reading: Reading) -> list[float]:
-        return [fault.since_s for fault in door.faults(replace(reading, time_s=time_s))]
+        return [fault.since_s for fault in judge.faults(replace(reading, time_s=time_s))]
 
     assert since(1.0, clear) == []
     assert since(2.0, inside) == since(3.0, inside) == since(9.0, inside) == [2.0]
