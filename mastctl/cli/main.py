@@ -71,7 +71,7 @@ OVERVIEW: Mapping[str, Mapping[str, tuple[str, str]]] = {
 
 EVERYWHERE = {
     "COMMAND -h": "show the options of a command and an example",
-    "--url ADDRESS": "of a daemon; default: $MASTCTL_URL or that of --config",
+    "--url ADDRESS": "of a daemon (default: $MASTCTL_URL, else --config)",
     "--json": "print one JSON document on stdout and nothing else",
     "--version": "print the version",
     "--print-completion SHELL": "for bash, zsh or tcsh",
