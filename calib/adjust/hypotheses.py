@@ -101,8 +101,6 @@ class Hypothesis:
     course
         When it is so: ``always``, in one of the groups (``once``), in each by numbers of its own, or from
         some group on.
-    side
-        Groups at least on either side of a change.
     """
 
     name: str
@@ -110,7 +108,6 @@ class Hypothesis:
     rows: Sequence[Effect]
     sentence: Callable[[Finding], str] | str
     course: Course = "always"
-    side: int = 1
 
     @cached_property
     def groups(self) -> list[list[Effect]]:
@@ -302,9 +299,10 @@ class ScoredFit:
         if what.course == "each":
             return [(0, self._gain(Score.side_by_side(scores)))]
         found, total = [], None
-        for at in range(len(scores) - 1, what.side - 1, -1):
+        side = 2 if self.problem.huber else 1  # where blunders were not left out, one picture may be one
+        for at in range(len(scores) - 1, side - 1, -1):
             total = scores[at] if total is None else scores[at] + total
-            if len(scores) - at >= what.side:
+            if len(scores) - at >= side:
                 gain = self._gain(total)
                 if what.subject[:1] == ("board",) or np.linalg.norm(gain.values) <= LARGEST:
                     found.append((at, gain))
@@ -415,7 +413,7 @@ def _placements(fit: ScoredFit) -> Iterator[Hypothesis]:
 
 
 def _changes(fit: ScoredFit) -> Iterator[Hypothesis]:
-    """The changes between two pictures that are looked for where a fit fails; one picture is a blunder."""
+    """The changes between two pictures that are tested where a fit fails."""
 
     def sentence(found: Finding) -> str:
         _, board, placement = found.subject
@@ -427,27 +425,27 @@ def _changes(fit: ScoredFit) -> Iterator[Hypothesis]:
     for board in dict.fromkeys(image.board for image in fit.images):
         if board not in fit.problem.fixed:
             rows = fit.of_board(board, lambda image, motions: motions.block.rates(("board", image.board)))
-            yield Hypothesis("board moved", ("board", *board), rows, sentence, "from", side=2)
+            yield Hypothesis("board moved", ("board", *board), rows, sentence, "from")
     if not fit.problem.upright:
         yield from _axes(fit)
-    yield from _joints(fit, "slip", side=2)
-    yield from _cameras(fit, "change", side=2)
+    yield from _joints(fit, "slip")
+    yield from _cameras(fit, "change")
 
 
-def _joints(fit: ScoredFit, what: Literal["slip", "drift"], side: int = 1) -> Iterator[Hypothesis]:
+def _joints(fit: ScoredFit, what: Literal["slip", "drift"]) -> Iterator[Hypothesis]:
     """Of each joint that it reads otherwise."""
     course: Course = "from" if what == "slip" else "always"
     for joint, name in enumerate(("pan", "tilt") if fit.readings else ()):
         rows = [row.part([joint]) for row in fit.readings]
-        yield Hypothesis(f"{what} of {name}", ("joint", name), rows, SENTENCES["joint", what], course, side)
+        yield Hypothesis(f"{what} of {name}", ("joint", name), rows, SENTENCES["joint", what], course)
 
 
-def _cameras(fit: ScoredFit, what: Literal["change", "drift"], side: int = 1) -> Iterator[Hypothesis]:
+def _cameras(fit: ScoredFit, what: Literal["change", "drift"]) -> Iterator[Hypothesis]:
     """Of each camera that has images left that its focal length and direction are others."""
     course: Course = "from" if what == "change" else "always"
     for name in fit.cameras:
         rows = fit.of_camera(name, lambda _, motions: motions.camera)
-        yield Hypothesis(f"{what} of {name}", ("camera", name), rows, SENTENCES["camera", what], course, side)
+        yield Hypothesis(f"{what} of {name}", ("camera", name), rows, SENTENCES["camera", what], course)
 
 
 def _axes(fit: ScoredFit) -> Iterator[Hypothesis]:
