@@ -28,7 +28,7 @@ from drivers.flir_ptu.axis import StepAxis, StepCount
 from drivers.flir_ptu.conversation import Conversation, StopCameFirst
 from drivers.flir_ptu.options import DEVICE, Options, options_from
 from drivers.flir_ptu.unit import SupplyWatch, checked_version, measure, ready_axes
-from drivers.flir_ptu.workshop import BENCH, probe
+from drivers.flir_ptu.workshop import BENCH, probe, talking
 from drivers.interfaces import AxisMotion, HeadInfo, PanTilt, Reading
 from drivers.registry import Driver
 from drivers.serial_line import OpenLine, SerialLine
@@ -373,16 +373,11 @@ def halt(
     twice all the same, unless the line is lost.
     """
     read = options_from(options)
-    line = open_line(read.port, read.baud, DEVICE)
-    talk = Conversation(line, DEVICE, lambda axis: None, clock or SystemClock())
-    try:
+    with talking(open_line(read.port, read.baud, DEVICE), clock) as talk:
         talk.send_at_once("H")  # before any question
         talk.send_at_once("H")
         talk.in_step()
-        with talk.patient():
-            talk.request("H")
-    finally:
-        talk.close()
+        talk.request("H")
     return ["pan and tilt halted (H), confirmed"]
 
 

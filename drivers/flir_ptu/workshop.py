@@ -55,7 +55,7 @@ def facts(port: str, baud: int, clock: Clock | None = None, open_line: OpenLine 
     ``clock`` and ``open_line`` are as of `drivers.flir_ptu.head.open_head`. Raises LineLost, NoReply,
     BadReply, Refused.
     """
-    with _talking(open_line(port, baud, DEVICE), clock) as talk:
+    with talking(open_line(port, baud, DEVICE), clock) as talk:
         return _facts(talk)
 
 
@@ -66,14 +66,14 @@ def home(port: str, baud: int, clock: Clock | None = None, open_line: OpenLine =
     ``open_line`` are as of `drivers.flir_ptu.head.open_head`. Raises LineLost, NoReply, BadReply, Refused if
     it does not come through.
     """
-    with _talking(open_line(port, baud, DEVICE), clock) as talk:
+    with talking(open_line(port, baud, DEVICE), clock) as talk:
         talk.reset(HOMING_S)
         return _facts(talk)
 
 
 @contextmanager
-def _talking(line: ByteLine, clock: Clock | None) -> Iterator[Conversation]:
-    """A conversation on a line of its own."""
+def talking(line: ByteLine, clock: Clock | None) -> Iterator[Conversation]:
+    """Hold a conversation on a line of its own."""
     talk = Conversation(line, DEVICE, lambda axis: None, clock or SystemClock())
     try:
         with talk.patient():
