@@ -36,10 +36,7 @@ LOG = "log"
 class Word:
     """The effect of a fault word on one kind of device.
 
-    Attributes
-    ----------
-    parameters
-        Parameter names with their defaults; the unit is in the name.
+    ``parameters`` are names with their defaults; the unit is in the name.
     """
 
     does: str

@@ -15,10 +15,7 @@ Ends = Mapping[str, tuple[float, float]]
 class ProbedHead(ABC):
     """A head that answered on a line.
 
-    Attributes
-    ----------
-    usable
-        Whether it can be the head of a configuration.
+    ``usable``: whether it can be the head of a configuration.
     """
 
     driver: str
@@ -43,10 +40,7 @@ class ProbedHead(ABC):
 class ProbedCamera:
     """A camera that has a format that is read.
 
-    Attributes
-    ----------
-    node
-        Its node now, which udev knows; None for a camera without one.
+    ``node`` is its node now, which udev knows; None for a camera without one.
     """
 
     card: str

@@ -29,10 +29,7 @@ class _Setting:
 class ValuesSet:
     """The values of one setting on one stream, as long as a frame may show them; safe from any thread.
 
-    Parameters
-    ----------
-    value
-        The one in force from the first frame on; None if that is not known.
+    ``value`` is the one in force from the first frame on; None if that is not known.
     """
 
     def __init__(self, value: float | None) -> None:

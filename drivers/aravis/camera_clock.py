@@ -99,10 +99,7 @@ class CameraClock:
     def window(self, stamp_s: float, stamped: Stamped, longest_s: float, arrived_s: float) -> ExposureWindow:
         """Return in which stretch of our time a frame was exposed.
 
-        Parameters
-        ----------
-        arrived_s
-            When its first packet came: the exposure was over.
+        At ``arrived_s`` its first packet came: the exposure was over.
         """
         begin_s = stamp_s + self.low_s - (0.0 if stamped == "start" else longest_s)
         end_s = stamp_s + self.high_s + (0.0 if stamped == "end" else longest_s)

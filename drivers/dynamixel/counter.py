@@ -24,10 +24,7 @@ MEETING_SHAPES = ((12, 0), (8, 2), (4, 4), (0, 2), (8, 4), (4, 2), (12, 2), (0, 
 class Counter:
     """One servo's counter, from the first answer that showed it.
 
-    Parameters
-    ----------
-    sent_s, received_s
-        When that was requested and when it came, seconds of our clock.
+    That was requested at ``sent_s`` and came at ``received_s``, seconds of our clock.
     """
 
     def __init__(self, tick: int, sent_s: float, received_s: float) -> None:

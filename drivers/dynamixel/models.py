@@ -71,10 +71,7 @@ Meaning = Callable[["ServoModel", int], str]
 class ServoModel(CountedModel):
     """One kind of servo, as of `CountedModel`.
 
-    Attributes
-    ----------
-    most_current_counts
-        The most that its current limit may be; 0 for a servo that measures its load only.
+    ``most_current_counts`` bounds its current limit; 0 for a servo that measures its load only.
     """
 
     number: int

@@ -72,10 +72,7 @@ def take_status(buffer: bytearray, *, at_end: bool = False) -> StatusPacket | No
 
     What comes before it (noise, echoes of instructions, packets whose checksum does not fit) is dropped.
 
-    Parameters
-    ----------
-    at_end
-        No more bytes will come: a header whose packet is not whole was noise, look behind it.
+    With ``at_end`` no more bytes will come: a header whose packet is not whole was noise.
     """
     while True:
         if not at_header(buffer, HEADER):

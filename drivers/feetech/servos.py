@@ -64,10 +64,7 @@ UNLOCKED, LOCKED = 0, 1
 class Item(Register):
     """One entry of a memory table.
 
-    Attributes
-    ----------
-    sign_bit
-        The bit that says minus; the rest is the size of the number. None for a number of zero or more.
+    ``sign_bit`` says minus, and the rest is the size of the number; None for a number of zero or more.
     """
 
     sign_bit: int | None = None
@@ -120,10 +117,7 @@ SCS = _table("big", Item("protective_torque", 37), Item("protective_time", 38), 
 class FeetechModel(CountedModel):
     """One kind of servo, as of `CountedModel`; the acceleration of an SCS, which has none, is assumed.
 
-    Attributes
-    ----------
-    speed_unit_counts
-        Counts a second of one unit of its speed: 1, or 50 in some firmware.
+    ``speed_unit_counts``: counts a second of one unit of its speed, 1, or 50 in some firmware.
     """
 
     registers: Mapping[str, Item]
@@ -216,10 +210,7 @@ def group_write_packet(parts: Sequence[Part]) -> bytes:
 def take_status(buffer: bytearray, *, at_end: bool = False) -> StatusPacket | None:
     """Take the first whole packet whose sum fits out of a buffer; None when there is none yet.
 
-    Parameters
-    ----------
-    at_end
-        No more bytes will come: a header whose packet is not whole was noise, look behind it.
+    With ``at_end`` no more bytes will come: a header whose packet is not whole was noise.
     """
     while True:
         if not at_header(buffer, HEADER):
@@ -332,10 +323,7 @@ class FeetechLink(BusLink):
 
         Raises NoReply, BadReply, LineLost if one is silent, or an answer is not of this question.
 
-        Parameters
-        ----------
-        servos
-            Of each id its model, all of one series, and its full torque limit, 0.1 %.
+        ``servos`` has of each id its model, all of one series, and its full torque limit, 0.1 %.
         """
         number = next(self.questions.numbers)
         start, token = FIRST_START + number % STARTS, number % TOKENS

@@ -91,10 +91,7 @@ def hits_of(line: bytes) -> tuple[str, ...]:
 def answer_of(line: bytes, command: str) -> PtuAnswer | None:
     """Return a line's answer to a command; None if it is not one.
 
-    Parameters
-    ----------
-    line
-        Without its end; limit hits in it are passed over.
+    The ``line`` comes without its end; limit hits in it are passed over.
     """
     rest, echo, exact = without_hits(line), False, False
     if not all(32 <= byte < 127 for byte in rest):

@@ -134,10 +134,7 @@ def checked_version(talk: Conversation, options: Options, known: str) -> str:
     Raises WrongDevice if it is another unit, or an E46 and the options do not say its resolutions; NoReply,
     BadReply, Refused, LineLost.
 
-    Parameters
-    ----------
-    known
-        Its earlier answers; empty if it was not queried yet.
+    ``known`` are its earlier answers; empty if it was not queried yet.
     """
     version = talk.sure_text("V")
     if known and version != known:
@@ -163,10 +160,7 @@ def ready_axes(
 
     Raises WrongDevice if it does not fit the options; NoReply, BadReply, Refused, LineLost.
 
-    Parameters
-    ----------
-    known
-        The axes before the unit or its line was away, whose usual speeds are kept; empty the first time.
+    ``known`` are the axes before the unit or its line was away, whose usual speeds are kept; empty at first.
     """
     talk.request("H")
     _try(talk, "CI")  # goals are positions, not speeds

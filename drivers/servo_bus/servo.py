@@ -76,10 +76,7 @@ class BusServo(ABC):
 
     Its methods raise NoReply, BadReply, Refused, LineLost.
 
-    Attributes
-    ----------
-    dropped
-        Whether its torque is off because setting it up needed that.
+    ``dropped``: whether its torque is off because setting it up needed that.
     """
 
     def __init__(self, link: BusLink, axis: str, settings: ServoAxisSettings, head: HeadSettings) -> None:

@@ -26,10 +26,7 @@ EXPOSURE_UNIT_S = 1e-4  # of V4L2_CID_EXPOSURE_ABSOLUTE
 class ControlMeaning:
     """Which controls a setting is.
 
-    Attributes
-    ----------
-    automatic, off
-        The control of its automatic, and that control's value for off.
+    ``automatic`` is the control of its automatic, ``off`` that control's value for off.
     """
 
     name: str
@@ -80,10 +77,7 @@ def value_of(node: Node, controls: Sequence[CameraControl], one: ControlMeaning)
 def settings_of(node: Node, options: CameraOptions, period_s: float | None) -> list[CameraSetting]:
     """Return what of a camera may be changed, as it is now.
 
-    Parameters
-    ----------
-    period_s
-        From frame to frame, which bounds an exposure; None if the camera does not say.
+    ``period_s`` is from frame to frame and bounds an exposure; None if the camera does not say.
     """
     controls, found = list_controls(node), []
     for one in MEANINGS:

@@ -27,10 +27,7 @@ READOUT_STAMPERS = ("uvcvideo",)
 class StampRule:
     """What is known of a camera's time stamps.
 
-    Attributes
-    ----------
-    margin_s
-        The camera's configured margin: how much earlier than its stamp says an exposure may have begun.
+    ``margin_s``, as configured: how much earlier than its stamp says an exposure may have begun.
     """
 
     margin_s: float
@@ -121,10 +118,7 @@ def exposure_window(
 class Spacing:
     """How long after the frame before a frame came at most, by what the frames themselves show.
 
-    Parameters
-    ----------
-    promised_s
-        From frame to frame by the camera's own word, seconds; None where it gives none.
+    ``promised_s`` is from frame to frame by the camera, seconds; None where it does not say.
     """
 
     def __init__(self, promised_s: float | None, margin_s: float) -> None:

@@ -34,10 +34,7 @@ class SimulatedServo:
 
     Raises BadOptions for an unknown model or register, or a value that the register cannot hold.
 
-    Parameters
-    ----------
-    settings
-        Initial values of registers, by name; those of the EEPROM outlast a reboot.
+    ``settings`` are initial values of registers, by name; those of the EEPROM outlast a reboot.
     """
 
     def __init__(

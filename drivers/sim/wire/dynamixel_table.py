@@ -78,10 +78,7 @@ class ControlTable:
 
         Raises Refused with the error number that the servo answers.
 
-        Parameters
-        ----------
-        locked
-            The EEPROM area is locked: torque is on, or the packet came to the secondary id.
+        The EEPROM area is ``locked`` while torque is on, and to a packet to the secondary id.
         """
         if not data:
             raise InstructionRefused(DATA_LENGTH)

@@ -122,10 +122,7 @@ class Cell:
 class SimulatedFeetech:
     """One model of servo.
 
-    Attributes
-    ----------
-    sync_read
-        Whether it answers a read of several servos at once.
+    ``sync_read``: whether it answers a read of several servos at once.
     """
 
     name: str

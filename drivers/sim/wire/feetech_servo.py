@@ -28,10 +28,7 @@ class SimulatedFeetechServo:
 
     Raises BadOptions for an unknown model or name, or a value that the memory cannot hold.
 
-    Parameters
-    ----------
-    settings
-        Initial values of its memory by name; those of the EEPROM outlast the power switch.
+    ``settings`` are initial values of its memory by name; those of the EEPROM outlast the power switch.
     """
 
     def __init__(
