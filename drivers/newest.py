@@ -265,10 +265,7 @@ class CapturedCamera(Camera, Generic[Arrived]):
 
     Safe from any thread. A camera that cannot be opened at first raises DriverError.
 
-    Attributes
-    ----------
-    gone_pause_s
-        Between tries to open a camera that is not there, where that disturbs nothing; 0: as of others.
+    ``gone_pause_s`` is between tries to open one that is not there, where that disturbs nothing; 0: as ever.
     """
 
     gone_pause_s = 0.0

@@ -128,10 +128,7 @@ class SerialLine:
     One thread reads; any may write beside it. Raises LineLost if it cannot be opened: no such device, no
     permission, or held by another program; BadOptions for a URL or a baud rate that cannot be.
 
-    Parameters
-    ----------
-    baud
-        Bits per second, any that the adapter can do; means nothing to ``socket://``.
+    ``baud`` is bits per second, any that the adapter can do; means nothing to ``socket://``.
     """
 
     def __init__(self, port: str, baud: int, device: str = "") -> None:

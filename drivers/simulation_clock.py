@@ -77,10 +77,7 @@ class _Waiting:
 class SimulationClock:
     """A clock for the simulated rover, an instance of `drivers.clock.Clock`.
 
-    Parameters
-    ----------
-    speed
-        Seconds of this clock in a second of real time, at most; infinite to wait for nothing.
+    ``speed`` is seconds of this clock in a second of real time, at most; infinite to wait for nothing.
     """
 
     runs = True

@@ -67,15 +67,9 @@ class _Manners:
 class Conversation:
     """The questions and answers on one open line; for one thread at a time.
 
-    Parameters
-    ----------
-    on_hit
-        Called with the axis, ``pan`` or ``tilt``, whenever an unrequested limit hit comes.
+    ``on_hit`` is called with the axis, ``pan`` or ``tilt``, whenever an unrequested limit hit comes.
 
-    Attributes
-    ----------
-    gives_way
-        Whether no question is sent any more after something was sent at once.
+    ``gives_way``: whether no question is sent any more after something was sent at once.
     """
 
     def __init__(self, line: ByteLine, device: str, on_hit: Callable[[str], None], clock: Clock) -> None:

@@ -41,15 +41,9 @@ class BusLink:
 
     Raises LineLost, BadOptions. `Overtaken` may come from every method but `write_at_once`.
 
-    Parameters
-    ----------
-    port, baud, reply_timeout_s, urgent, clock, open_line
-        As of `Port`.
+    Parameters are as of `Port`.
 
-    Attributes
-    ----------
-    finds_echo
-        Whether it is found out at the start if the adapter gives back what is sent.
+    ``finds_echo``: whether it is found out at the start if the adapter gives back what is sent.
     """
 
     packets: ClassVar[PacketFormat]

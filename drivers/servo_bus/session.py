@@ -46,15 +46,9 @@ def distrusted(reason: str) -> GivenUp:
 class ServoSession:
     """Two servos on one open line; for the one thread that owns it.
 
-    Parameters
-    ----------
-    clock
-        Stamps the readings; deadlines run on that of the pair's line.
+    The ``clock`` stamps the readings; deadlines run on that of the pair's line.
 
-    Attributes
-    ----------
-    poll_due_s
-        When the servos want to be read again, seconds of the line's clock.
+    ``poll_due_s``: when the servos want to be read again, seconds of the line's clock.
     """
 
     def __init__(self, pair: ServoPair, watch: SessionWatch, head: HeadSettings, clock: Clock) -> None:

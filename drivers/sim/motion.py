@@ -26,10 +26,7 @@ class Leg:
     A start faster than ``speed_rad_per_s`` brakes to it first; a goal nearer than the stopping distance
     is overshot and come back to.
 
-    Attributes
-    ----------
-    start_s, start_rad, start_rad_per_s
-        When, where and how fast (signed) the leg begins.
+    It begins at ``start_s``, at ``start_rad``, with the signed speed ``start_rad_per_s``.
     """
 
     start_s: float

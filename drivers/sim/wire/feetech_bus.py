@@ -75,15 +75,9 @@ class FeetechInstructionParser:
 class FeetechBus:
     """Servos on one line, a ``WireDevice``; safe from any thread.
 
-    Parameters
-    ----------
-    echoes
-        Whether the adapter is a half-duplex one that gives the host its own bytes back.
+    ``echoes``: whether the adapter is a half-duplex one that gives the host its own bytes back.
 
-    Attributes
-    ----------
-    host_baud
-        Bits a second of the host, set by the line; a servo with another rate hears nothing.
+    ``host_baud``: of the host, set by the line; a servo with another rate hears nothing.
     """
 
     renamed = staticmethod(renamed)

@@ -168,10 +168,7 @@ class TcpLine(_KernelLine):
 
     Raises BadOptions if it cannot listen there.
 
-    Parameters
-    ----------
-    device, clock, faults, wire_time, observer
-        As of ``PtyLine``; by default bytes take no time, since the network is faster than the device's line.
+    Parameters are as of `PtyLine`; bytes usually take no time: the network is faster than the device.
     """
 
     def __init__(
