@@ -68,7 +68,6 @@ class Conversation:
     """The questions and answers on one open line; for one thread at a time.
 
     ``on_hit`` is called with the axis, ``pan`` or ``tilt``, whenever an unrequested limit hit comes.
-
     ``gives_way``: whether no question is sent any more after something was sent at once.
     """
 

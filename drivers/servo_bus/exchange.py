@@ -42,7 +42,6 @@ class BusLink:
     Raises LineLost, BadOptions. `Overtaken` may come from every method but `write_at_once`.
 
     Parameters are as of `Port`.
-
     ``finds_echo``: whether it is found out at the start if the adapter gives back what is sent.
     """
 

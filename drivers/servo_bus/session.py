@@ -47,7 +47,6 @@ class ServoSession:
     """Two servos on one open line; for the one thread that owns it.
 
     The ``clock`` stamps the readings; deadlines run on that of the pair's line.
-
     ``poll_due_s``: when the servos want to be read again, seconds of the line's clock.
     """
 

@@ -76,7 +76,6 @@ class FeetechBus:
     """Servos on one line, a ``WireDevice``; safe from any thread.
 
     ``echoes``: whether the adapter is a half-duplex one that gives the host its own bytes back.
-
     ``host_baud``: of the host, set by the line; a servo with another rate hears nothing.
     """
 
