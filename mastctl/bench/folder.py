@@ -24,6 +24,9 @@ from mastctl.json_lines import append_line
 
 JOURNAL = "bench.jsonl"
 
+BOARD = "board"
+"""The board's name in a survey."""
+
 FORMER = "former_mast.yaml"
 """The mast file that was in use when the run began."""
 
@@ -31,8 +34,8 @@ FORMER = "former_mast.yaml"
 class RunFolder:
     """The folder of one run; whatever it was given is on the disk when a call returns.
 
-    A new folder, or that of a run with the same boards (by name), sigmas and cameras, which goes on. Once
-    ``let_go`` is called another run may go on with it; the end of the process does the same.
+    A new folder, or that of a run with the same board, sigmas and cameras, which goes on. Once ``let_go`` is
+    called another run may go on with it; the end of the process does the same.
 
     Raises
     ------
@@ -40,18 +43,11 @@ class RunFolder:
         If the folder holds something else, or another run keeps its looks there.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        boards: Mapping[str, AnyBoard],
-        sigma: Sigma,
-        cameras: Mapping[str, SurveyCamera],
-        stereo: Mapping[str, tuple[str, str]],
-    ) -> None:
+    def __init__(self, path: Path, board: AnyBoard, sigma: Sigma, rig: Rig) -> None:
         self.path, self.sigma_px = path, sigma.corner_px
-        self._folder = BenchFolder(path, boards, sigma, cameras, stereo)
+        self._cameras = survey_cameras(rig)
+        self._folder = BenchFolder(path, {BOARD: board}, sigma, self._cameras, rig.stereo)
         self.let_go = weakref.finalize(self, os.close, _locked(path))
-        self._cameras = cameras
         self._journal = path / JOURNAL
         self.notes = read_notes(path)
         self._numbers: dict[str, int] = {}
@@ -74,16 +70,16 @@ class RunFolder:
         """Return all that was seen."""
         return self._folder.survey()
 
-    def note(self, **told: Any) -> None:
+    def note(self, **line: Any) -> None:
         """Write a line into the journal."""
-        line = json.dumps(told, allow_nan=False)
+        text = json.dumps(line, allow_nan=False)
         try:
-            append_line(self._journal, line.encode() + b"\n")
+            append_line(self._journal, text.encode() + b"\n")
         except OSError as error:
             raise NotWritten(self._journal, "", f"cannot be written: {error.strerror or error}") from None
-        self.notes.append(told)
+        self.notes.append(line)
 
-    def add(self, placement: str, board: str, look: BenchLook, check: bool) -> None:
+    def add(self, placement: str, look: BenchLook, check: bool) -> None:
         """Keep the pictures of a look that show the board."""
         number = self._numbers.get(placement, 0) + 1
         for one in look.found:
@@ -100,7 +96,7 @@ class RunFolder:
                 tilt_rad=look.tilt_rad if on_head else None,
                 file=Path("images") / f"{name}.png" if one.data else Path(),
                 row=0,
-                board=board,
+                board=BOARD,
                 pan_approach=cast(Approach, sides[0]),
                 tilt_approach=cast(Approach, sides[1]),
             )
@@ -108,12 +104,11 @@ class RunFolder:
         self._numbers[placement] = number
         self.note(event="look", placement=placement, number=number, seconds=round(look.seconds, 3))
 
-    def asked(self, name: str) -> Placement | None:
-        """Return what was asked for at a placement; None if nothing was, or a kill cut it short."""
+    def requested(self, name: str) -> Placement | None:
+        """Return where a placement was requested; None if it was not, or a kill cut it short."""
         for note in self.notes:
             if note.get("event") == "placement" and note.get("name") == name:
-                asked = dict(note["asked"])
-                return Placement(**{**asked, "turned_deg": tuple(asked["turned_deg"])})
+                return Placement(**{**note["asked"], "turned_deg": tuple(note["asked"]["turned_deg"])})
         return None
 
     def is_over(self, name: str) -> bool:

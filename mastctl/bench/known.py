@@ -54,13 +54,12 @@ class BenchKnowledge:
         self,
         head: BenchHead,
         kept: RunFolder,
-        board_name: str,
         board: AnyBoard,
         fit: FitSurvey,
         say: Callable[[str], None],
     ) -> None:
         self.head, self.board, self.kept = head, board, kept
-        self._board_name, self._fit, self._say = board_name, fit, say
+        self._fit, self._say = fit, say
         self.workspace = Workspace(
             first_cameras(head.rig),
             _within(head.pan_limits_rad, USUAL_PAN_RAD),
@@ -190,7 +189,7 @@ class BenchKnowledge:
     def take(self, name: str, look: BenchLook, check: bool = False) -> None:
         """Keep a look at a placement, add it to what is known, and fit beside what comes next if it is
         worth it."""
-        self.kept.add(name, self._board_name, look, check)
+        self.kept.add(name, look, check)
         self.looks.append((name, check, look))
         if name not in self.now.boards:
             self.now = replace(self.now, boards={**self.now.boards, name: self._board_from(look)})
@@ -202,7 +201,7 @@ class BenchKnowledge:
             self._pending = len(self.looks), self._pool.submit(self._fit, self.kept.survey())
 
     def collect(self, wait: bool = False) -> None:
-        """Take over a fit that is ready; with ``wait``, the one under way. One that fails is told."""
+        """Take over a fit that is ready; with ``wait``, the one under way. One that fails is reported."""
         if self._pending is None or not (wait or self._pending[1].done()):
             return
         looks, future = self._pending

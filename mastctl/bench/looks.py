@@ -39,7 +39,7 @@ class BenchGoal:
     checks: int = 5
 
     def at_least_px(self, counts_px: float) -> float:
-        """Return what the calibration may leave: as asked, or what counts leave anyway."""
+        """Return what the calibration may leave: as requested, or what counts leave anyway."""
         return max(self.pointing_px, counts_px)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 import html
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -24,20 +23,6 @@ LARGEST_BYTES = 50_000_000
 _TITLE = re.compile(rb"<title>([^<]{1,300})</title>")
 
 
-@dataclass(frozen=True)
-class Report:
-    """A report: its name, file, title and when it was written (ISO 8601, UTC)."""
-
-    name: str
-    path: Path
-    title: str
-    written: str
-
-    def summary(self) -> ReportSummary:
-        """Return it as JSON, without its place."""
-        return {"name": self.name, "title": self.title, "written": self.written}
-
-
 class Reports:
     """The reports of one daemon."""
 
@@ -45,11 +30,11 @@ class Reports:
         self.folder = state / "reports"
         self._runs = runs
 
-    def all(self) -> list[Report]:
-        """Return them, the newest first."""
+    def summaries(self) -> list[ReportSummary]:
+        """Return their names, titles and when they were written (ISO 8601, UTC), the newest first."""
         found = {name: path for name, path in self._files() if NAME.fullmatch(name)}
-        reports = [one for name, path in found.items() if (one := _report(name, path)) is not None]
-        return sorted(reports, key=lambda one: one.written, reverse=True)[:SHOWN]
+        reports = [one for name, path in found.items() if (one := _summary(name, path)) is not None]
+        return sorted(reports, key=lambda one: one["written"], reverse=True)[:SHOWN]
 
     def page(self, name: str) -> bytes:
         """Return a report's HTML.
@@ -92,7 +77,7 @@ def _is_own(path: Path) -> bool:
     return is_plain_file(path) and not path.is_symlink()
 
 
-def _report(name: str, path: Path) -> Report | None:
+def _summary(name: str, path: Path) -> ReportSummary | None:
     if not _is_own(path):
         return None
     try:
@@ -101,6 +86,6 @@ def _report(name: str, path: Path) -> Report | None:
         written = datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat(timespec="seconds")
     except OSError:
         return None
-    title = _TITLE.search(head)
-    text = html.unescape(title[1].decode(errors="replace")) if title else name
-    return Report(name, path, " ".join(text.split()), written)
+    found = _TITLE.search(head)
+    title = html.unescape(found[1].decode(errors="replace")) if found else name
+    return {"name": name, "title": " ".join(title.split()), "written": written}

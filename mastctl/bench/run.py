@@ -18,7 +18,7 @@ from calib.targets.boards import AnyBoard
 from mastctl.bench.check import Checked, point_at_corners, unvisited
 from mastctl.bench.daemon_eyes import DaemonEyes
 from mastctl.bench.eyes import BenchEyes
-from mastctl.bench.folder import RunFolder, survey_cameras
+from mastctl.bench.folder import RunFolder
 from mastctl.bench.frame import FitSurvey, FittedBench, RoverFrame, fit_in_rover, frame_of
 from mastctl.bench.known import BenchKnowledge
 from mastctl.bench.looks import FEWEST_LOOKS, BenchGoal, Looks, deg
@@ -39,7 +39,6 @@ class BenchRun:
         self,
         eyes: BenchEyes,
         kept: RunFolder,
-        board_name: str,
         board: AnyBoard,
         reporter: Reporter,
         fit: FitSurvey,
@@ -48,7 +47,7 @@ class BenchRun:
     ) -> None:
         self.wanted, self._eyes, self._reporter, self._kept = wanted, eyes, reporter, kept
         self._simulated = simulated
-        self.known = BenchKnowledge(eyes.head, kept, board_name, board, fit, reporter.say)
+        self.known = BenchKnowledge(eyes.head, kept, board, fit, reporter.say)
         self._looks = Looks(eyes, self.known, reporter, wanted)
 
     def run(self) -> FittedBench:
@@ -117,7 +116,7 @@ class BenchRun:
             self._reporter.say(f"not yet enough for a fit: {reason}")
             known.believe_boards()
         name = known.placements()[-1]
-        placement = self._kept.asked(name)
+        placement = self._kept.requested(name)
         if self._simulated is not None and placement is not None and not self._simulated.is_there:
             self._simulated.stand(placement)
         if self._kept.is_over(name):
@@ -193,8 +192,8 @@ def open_run(
     eyes = DaemonEyes(client, cameras or list(status["cameras"]), board)
     head = eyes.head
     sigma = Sigma(0.0, 0.0, joint_rad=head.count_rad / 12**0.5, corner_px=0.1)
-    kept = RunFolder(folder, {"board": board}, sigma, survey_cameras(head.rig), head.rig.stereo)
+    kept = RunFolder(folder, board, sigma, head.rig)
     kept.begin(client.mast_file(), frame or RoverFrame())
     fit = fit_in_rover(frame_of(kept.notes), head.rig, kept.moved)
     simulated = SimulatedBoard(client, board, head.rig) if status["simulated"] else None
-    return BenchRun(eyes, kept, "board", board, reporter, fit, wanted, simulated)
+    return BenchRun(eyes, kept, board, reporter, fit, wanted, simulated)

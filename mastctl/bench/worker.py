@@ -67,7 +67,7 @@ def work(job: BenchJob, link: Connection) -> None:
 class LinkReporter:
     """Keeps a run up to date and sends it to the daemon at each change; see `Reporter`.
 
-    The process ends with the link: there is nobody left that renews the lease.
+    The process ends with the link: the lease is not renewed any more.
     """
 
     def __init__(self, run: BenchRunRecord, link: Connection) -> None:

@@ -1,4 +1,4 @@
-"""Which camera model each camera of a survey or bench earns, told as sentences and for programs."""
+"""Which camera model each camera of a survey or bench earns, as sentences and as JSON."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def compared(survey: Survey) -> dict[str, tuple[FamilyScore, ...]]:
     return found
 
 
-def families_told(survey: Survey, families: Compared) -> dict[str, Any]:
+def families_as_json(survey: Survey, families: Compared) -> dict[str, Any]:
     """Return for programs: each camera's scores, and the model that it earns."""
     return {
         name: {

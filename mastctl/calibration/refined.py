@@ -1,4 +1,4 @@
-"""From records of hand-offs to a mast file with corrected body cameras: proposed, judged, and told."""
+"""From records of hand-offs to a mast file with corrected body cameras: proposed and judged."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from calib.files.mast_file import StoredRig
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
 from calib.matching.handed_over import HandoffBias, MatchedHandoff, handoff_bias
-from mastctl.calibration.mast_file import rounded_matrix, save_new, with_correction
+from mastctl.calibration.mast_file import picked, rounded_matrix, save_new, with_correction
 from mastctl.watch.handoffs import ReadLog
 
 SHIFT_FIRST = (3, 4, 5, 0, 1, 2)
@@ -62,7 +62,7 @@ class Proposal:
             codes.append("not_significant")
             sentences.append(
                 f"{group}: {len(pose.used.handoffs)} hand-offs show no correction: {pose.sigmas:.1f} sigma "
-                "where 3 are asked for"
+                "where 3 are needed"
             )
         if self.other_mast:
             sentences.append(f"{self.other_mast} hand-offs were made with another mast file")
@@ -122,45 +122,39 @@ def refined_rig(proposal: Proposal) -> Rig:
     for pose in proposal.significant.values():
         known = None if known is None else corrected_covariance(rig, known, pose)
         rig = corrected_rig(rig, pose)
-    told = {group: pose_told(pose) for group, pose in proposal.significant.items()}
+    corrections = {group: pose_as_json(pose) for group, pose in proposal.significant.items()}
     by = {
         "cameras": [name for pose in proposal.significant.values() for name in pose.cameras],
         "records": [{"file": log.path.name, "digest": log.digest} for log in proposal.logs],
         "handoffs": {g: len(p.used.handoffs) for g, p in proposal.significant.items()},
     }
-    return with_correction(proposal.mast, rig, known, {"refined": told}, by)
+    return with_correction(proposal.mast, rig, known, {"refined": corrections}, by)
 
 
-def pose_told(pose: BodyPose) -> dict[str, Any]:
+def pose_as_json(pose: BodyPose) -> dict[str, Any]:
     """Return a correction as JSON or YAML; the shift is of the origin, the turn about it, rover axes.
 
     Its covariance is of the shift, then the turn.
     """
-    told: dict[str, Any] = {
-        "cameras": list(pose.cameras),
-        "origin_m": pose.origin_m.tolist(),
+    correction: dict[str, Any] = {
+        **picked(pose, "cameras", "origin_m", "chance", "chi2_before", "chi2_after", "degrees_of_freedom"),
         "shift_m": pose.step[3:].tolist(),
         "turn_rad": pose.step[:3].tolist(),
         "covariance": rounded_matrix(pose.covariance[np.ix_(SHIFT_FIRST, SHIFT_FIRST)]).tolist(),
         "prior_sigma": {"shift_m": PRIOR_SHIFT_M, "turn_rad": PRIOR_TURN_RAD},
         "significance_sigmas": pose.sigmas,
-        "chance": pose.chance,
         "handoffs": len(pose.used.handoffs),
         "outliers": [one.sentence for one in pose.outliers],
         "rms_px": {
-            name: {"before": list(before), "after": list(after)}
-            for name, (before, after) in pose.rms_px.items()
+            name: dict(zip(("before", "after"), map(list, sizes))) for name, sizes in pose.rms_px.items()
         },
-        "chi2_before": pose.chi2_before,
-        "chi2_after": pose.chi2_after,
-        "degrees_of_freedom": pose.degrees_of_freedom,
         "directions_seen": pose.seen,
         "unseen": list(pose.unseen),
     }
     if pose.cameras_apart is not None:
-        told["eyes_apart"] = {
+        correction["cameras_apart"] = {
             "right_less_left_px": pose.cameras_apart.offset_px.tolist(),
             "covariance_px2": pose.cameras_apart.covariance_px2.tolist(),
             "sigmas": pose.cameras_apart.sigmas,
         }
-    return told
+    return correction

@@ -124,7 +124,7 @@ def families_of(args: argparse.Namespace, survey: Survey) -> tuple[dict[str, Any
 
     with output.waiting(args.json, "comparing camera models"):
         found = families.compared(survey)
-    return {"models": families.families_told(survey, found)}, families.families_lines(survey, found)
+    return {"models": families.families_as_json(survey, found)}, families.families_lines(survey, found)
 
 
 def _check_out(out: Path, survey: Survey) -> None:

@@ -55,7 +55,7 @@ def _check_out(out: Path, read: list[Path]) -> None:
 
 
 def _document(proposal: Proposal, saved: StoredRig | None, previous: Path | None) -> dict[str, Any]:
-    from mastctl.calibration.refined import pose_told
+    from mastctl.calibration.refined import pose_as_json
     from mastctl.watch.handoffs import bias_record
 
     return {
@@ -68,7 +68,7 @@ def _document(proposal: Proposal, saved: StoredRig | None, previous: Path | None
         },
         "former": {"path": str(proposal.mast.path), "digest": proposal.mast.digest},
         "corrections": {
-            group: {**pose_told(pose), "significant": pose.significant}
+            group: {**pose_as_json(pose), "significant": pose.significant}
             for group, pose in proposal.poses.items()
         },
         "refusals": {

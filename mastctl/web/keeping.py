@@ -198,8 +198,8 @@ def add_bench(app: FastAPI) -> None:
     @app.get(f"{PREFIX}/reports", summary="The reports that can be read")
     async def listed(here: Here) -> ReportList:
         reports = here.service.reports
-        found = await here.waiting.run(reports.all)
-        return {"reports": [one.summary() for one in found], "folder": str(reports.folder)}
+        found = await here.waiting.run(reports.summaries)
+        return {"reports": found, "folder": str(reports.folder)}
 
     @app.get(
         f"{PREFIX}/reports/{{name}}",

@@ -15,7 +15,7 @@ from calib.survey.records import Sigma
 from calib.targets.boards import Charuco
 from hil_tests.mastctl.bench.bench_of_corners import CornerBench, SelfPlacing, TrueAxis
 from mastctl.bench.eyes import BenchEyes, BenchHead
-from mastctl.bench.folder import RunFolder, survey_cameras
+from mastctl.bench.folder import RunFolder
 from mastctl.bench.frame import RoverFrame, fit_in_rover
 from mastctl.bench.looks import BenchGoal
 from mastctl.bench.reporter import Reporter
@@ -59,9 +59,8 @@ def corner_bench(
 
 def kept_in(folder: Path, bench: CornerBench) -> RunFolder:
     """The run's folder."""
-    rig = bench.head.rig
     sigma = Sigma(0.0, 0.0, joint_rad=PTU_COUNT_RAD / 12**0.5, corner_px=bench.noise_px)
-    return RunFolder(folder, {"board": BOARD}, sigma, survey_cameras(rig), rig.stereo)
+    return RunFolder(folder, BOARD, sigma, bench.head.rig)
 
 
 def run_of(
@@ -75,5 +74,5 @@ def run_of(
     person = SelfPlacing(bench)
     kept = kept_in(folder, bench)
     fit = fit_in_rover(RoverFrame(), bench.head.rig, kept.moved)
-    run = BenchRun(eyes or bench, kept, "board", BOARD, reporter or person, fit, wanted or BenchGoal())
+    run = BenchRun(eyes or bench, kept, BOARD, reporter or person, fit, wanted or BenchGoal())
     return run, person
