@@ -146,7 +146,8 @@ def pose_as_json(pose: BodyPose) -> dict[str, Any]:
         "handoffs": len(pose.used.handoffs),
         "outliers": [one.sentence for one in pose.outliers],
         "rms_px": {
-            name: dict(zip(("before", "after"), map(list, sizes))) for name, sizes in pose.rms_px.items()
+            name: {"before": list(before), "after": list(after)}
+            for name, (before, after) in pose.rms_px.items()
         },
         "directions_seen": pose.seen,
         "unseen": list(pose.unseen),
