@@ -22,6 +22,7 @@ from numpy.typing import ArrayLike
 from calib.errors import BadFile
 from calib.geometry.cahvor import CameraModel, Kind
 
+UNKNOWN_FRAME = "unknown"
 #: A shift of a pixel by the normalisation of A and O is noted from this size on.
 SHIFT_NOTE_PX = 0.01
 #: No component of a camera model or a mast is larger; beyond it the arithmetic would overflow.

@@ -23,14 +23,13 @@ from typing import Any, cast
 import numpy as np
 
 from calib.errors import BadFile
-from calib.files import CameraFile, build_model, digest_of, text_of
+from calib.files import UNKNOWN_FRAME, CameraFile, build_model, digest_of, text_of
 from calib.files.atomic import save_bytes
 from calib.files.yaml_text import plain
 from calib.geometry.cahvor import CameraModel, Kind
 from calib.geometry.rigid import FloatArray
 
 MAX_BYTES = 1_000_000
-UNKNOWN_FRAME = "unknown"
 
 _LINE = re.compile(r"\s*([A-Za-z]\w*(?: internal)?)\s*=\s*(.*?)\s*")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")

@@ -24,8 +24,6 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.lenses import opencv
 from calib.geometry.rigid import FloatArray, Rigid
 
-UNKNOWN_FRAME = "unknown"
-
 LensName = Literal[
     "plumb_bob",
     "rational_polynomial",
@@ -107,13 +105,8 @@ def read_foreign(
     """Return the record of another program's keys, and where it was read, with a note of unread keys.
 
     ``other_names`` are further names of a record's keys, ``ignored`` keys that say nothing of the camera,
-    ``remedies`` what to do where a key is missing.
-
-    Raises
-    ------
-    BadFile
-        As `calib.files.records.read_record`, or if an unread key may change the camera, is nearly a known
-        one, or contradicts another name of the same.
+    ``remedies`` what to do where a key is missing. Raises BadFile as `calib.files.records.read_record`, or if
+    an unread key may change the camera, is nearly a known one, or contradicts another name of the same.
     """
     if not isinstance(keys, dict):
         raise BadFile(path, place, f"{kind_of(keys)} where a mapping is expected")

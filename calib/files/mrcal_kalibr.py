@@ -30,10 +30,9 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from calib.errors import BadFile
-from calib.files import CameraFile, build_model, digest_of
+from calib.files import UNKNOWN_FRAME, CameraFile, build_model, digest_of
 from calib.files.foreign import (
     LENSES,
-    UNKNOWN_FRAME,
     Numbers,
     Source,
     coefficients,
