@@ -26,7 +26,7 @@ from mastctl.web.parts import Here, Parts
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Mapping[str, Any]])
 
-STOP_ANSWER_S = 3.0  # the devices give a stop 1 s; beyond this it is told that nothing is known
+STOP_ANSWER_S = 3.0  # the devices give a stop 1 s; beyond this the answer is that nothing is known
 NOTHING: Mapping[str, Any] = {}
 
 
@@ -91,10 +91,10 @@ def command(
             request: Request, here: Parts, asked: CommandRequest, **given: Any
         ) -> Mapping[str, Any]:
             own = {name: one for name, one in (("here", here), ("asked", asked)) if name in wanted.parameters}
-            told = recorded(**given, **own) if recorded is not None else _told(given)
+            sent = recorded(**given, **own) if recorded is not None else _request_of(given)
             allowed_s = None if usual_s is None else usual_s(here, **given)
             work = partial(act, **given, **own)
-            return await carried_out(here, request, kind, asked, told, work, allowed_s, beside)
+            return await carried_out(here, request, kind, asked, sent, work, allowed_s, beside)
 
         kinds = {"request": Request, "here": Here, "asked": Asks}
         parameters = [Parameter(name, Parameter.KEYWORD_ONLY, annotation=one) for name, one in kinds.items()]
@@ -117,22 +117,22 @@ async def carried_out(
     request: Request,
     kind: Command,
     asked: CommandRequest,
-    told: Mapping[str, Any],
+    sent: Mapping[str, Any],
     act: Callable[[], Answer],
     usual_s: float | None = None,
     beside: bool = False,
 ) -> Answer:
     """Return the answer of a command, whose refusals are those of `mastctl.control.entry.CommandEntry.run`.
 
-    A ``deadline_s`` in what is ``told`` counts as the header does, the shorter of both. ``beside``: of the
+    A ``deadline_s`` in what is ``sent`` counts as the header does, the shorter of both. ``beside``: of the
     request nothing is kept but who asks, when, and under which lease.
     """
     request.scope["state"]["recorded"] = True  # whatever comes of it
-    deadline_s = _shorter(asked.deadline_s, told.get("deadline_s"))
+    deadline_s = _shorter(asked.deadline_s, sent.get("deadline_s"))
     if beside:
         asked = replace(asked, key=None)
         return await stopped(here.service, lambda: here.service.entry.run(kind, asked, act))
-    asked = replace(asked, request=told, deadline_s=deadline_s)
+    asked = replace(asked, request=sent, deadline_s=deadline_s)
     return await here.waiting.run(lambda: here.service.entry.run(kind, asked, act, usual_s))
 
 
@@ -141,14 +141,14 @@ async def stop_first(
     kind: Command,
     request: Request,
     act: Callable[[], Answer],
-    told: Mapping[str, Any] = NOTHING,
+    sent: Mapping[str, Any] = NOTHING,
     late: Callable[[], Awaitable[Mapping[str, Any]]] | None = None,
 ) -> Answer:
     """Return the answer of a stop: nothing is asked and no header is judged before it acts.
 
-    ``late`` returns what was ``told`` after that; the stop is recorded with it then.
+    ``late`` returns what was ``sent`` after that; the stop is recorded with it then.
     """
-    asked = CommandRequest(caller_of(request), request=told, lease=request.headers.get("mastctl-lease"))
+    asked = CommandRequest(caller_of(request), request=sent, lease=request.headers.get("mastctl-lease"))
     entry, answer, failure = here.service.entry, None, None
     try:
         answer = await stopped(here.service, lambda: entry.first(kind, asked, act, late is None))
@@ -182,15 +182,15 @@ def caller_of(request: Request) -> Caller:
     )
 
 
-def _told(given: Mapping[str, Any]) -> dict[str, Any]:
+def _request_of(given: Mapping[str, Any]) -> dict[str, Any]:
     """What a request says in its path, its query and its body."""
-    told: dict[str, Any] = {}
+    sent: dict[str, Any] = {}
     for name, value in given.items():
         if isinstance(value, BaseModel):
-            told |= value.model_dump(exclude_none=True)
+            sent |= value.model_dump(exclude_none=True)
         elif value is not None:
-            told[name] = value
-    return told
+            sent[name] = value
+    return sent
 
 
 def _shorter(one_s: float | None, other_s: float | None) -> float | None:

@@ -88,12 +88,12 @@ def add_masts(app: FastAPI) -> None:
     @command(app, "POST /mast", MAST, "Use another mast file, or the former one, from now on")
     def load_mast(body: MastBody, here: Here) -> MastChange:
         masts = here.service.masts
-        return _masts_told(masts, masts.back() if body.file is None else masts.load(body.file))
+        return _mast_change(masts, masts.back() if body.file is None else masts.load(body.file))
 
     @command(app, "POST /mast/back", MAST_BACK, "Go back to the former mast file")
     def back(here: Here) -> MastChange:
         masts = here.service.masts
-        return _masts_told(masts, masts.back())
+        return _mast_change(masts, masts.back())
 
     @command(
         app, "POST /reload", RELOAD, "Read the configuration again: all of it comes into use, or nothing"
@@ -102,7 +102,7 @@ def add_masts(app: FastAPI) -> None:
         return reload(here.service)
 
 
-def _masts_told(masts: Masts, mast: MastInUse) -> MastChange:
+def _mast_change(masts: Masts, mast: MastInUse) -> MastChange:
     former = masts.former
     return {"mast": mast.as_json(), "former_mast": None if former is None else former.as_json()}
 
