@@ -31,8 +31,9 @@ LIMITS = Limits((-2.5, 2.5), (-1.4, 1.4), 1.0)
 
 
 def simulated(clock: ManualClock, **more: Any) -> SimulatedPanTilt:
-    told = {"pan_harmonics_rad": HARMONICS, "tilt_harmonics_rad": HARMONICS, "backlash_rad": BACKLASH_RAD}
-    settings = head_settings({"preset": "dynamixel_x", "sag_rad": 0.0} | told | more)
+    harmonics = [list(one) for one in HARMONICS]
+    gears = {"pan_harmonics_rad": harmonics, "tilt_harmonics_rad": harmonics, "backlash_rad": BACKLASH_RAD}
+    settings = head_settings({"preset": "dynamixel_x", "sag_rad": 0.0} | gears | more)
     return SimulatedPanTilt(settings, clock)
 
 
