@@ -15,8 +15,8 @@ from calib.geometry.solutions import choose
 from calib.geometry.stereo import triangulate
 from calib.plan.knowledge import BenchShot
 from calib.plan.poses import candidates
-from mastctl.bench.eyes import BenchEyes, BenchLook, NotThere, SeenBoard
 from mastctl.bench.known import BenchKnowledge
+from mastctl.bench.mast import BenchLook, BenchMast, NotThere, SeenBoard
 
 POINTINGS = 4
 
@@ -83,7 +83,7 @@ def unvisited(known: BenchKnowledge, placement: str, count: int) -> Iterator[Ben
 
 
 def point_at_corners(
-    eyes: BenchEyes, known: BenchKnowledge, placement: str, clicked: Sequence[BenchLook]
+    mast: BenchMast, known: BenchKnowledge, placement: str, clicked: Sequence[BenchLook]
 ) -> Iterator[CornerPointing]:
     """Point once at corners that former looks show off the middle, and yield what was measured."""
     rng = np.random.default_rng(len(clicked))
@@ -99,7 +99,7 @@ def point_at_corners(
         common = np.array(sorted(set.intersection(*ids)))
         rng.shuffle(common)
         for corner in common[:2]:
-            pointing = _point(eyes, known, placement, look, seen, int(corner))
+            pointing = _point(mast, known, placement, look, seen, int(corner))
             if pointing is not None:
                 done += 1
                 yield pointing
@@ -107,7 +107,7 @@ def point_at_corners(
 
 
 def _point(
-    eyes: BenchEyes,
+    mast: BenchMast,
     known: BenchKnowledge,
     placement: str,
     look: BenchLook,
@@ -115,7 +115,7 @@ def _point(
     corner: int,
 ) -> CornerPointing | None:
     """Bring one corner to the middle of the first camera's image; None where that cannot be tried."""
-    rig, cameras, head = known.now.rig, known.workspace.cameras, eyes.head
+    rig, cameras, head = known.now.rig, known.workspace.cameras, mast.head
     sides = look.pan_approach, look.tilt_approach
     true_rad = [rig.joints.true_rad((seen[name].pan_rad, seen[name].tilt_rad), sides) for name in cameras]
     models = [rig.camera_in_rover(name, *at) for name, at in zip(cameras, true_rad, strict=True)]
@@ -139,7 +139,7 @@ def _point(
     if not head.one_sided:
         sides = (1 if angles.pan_rad > true_rad[0][0] else -1, 1 if angles.tilt_rad > true_rad[0][1] else -1)
     try:
-        landed = eyes.look(*rig.joints.read_rad((angles.pan_rad, angles.tilt_rad), sides), sides)
+        landed = mast.look(*rig.joints.read_rad((angles.pan_rad, angles.tilt_rad), sides), sides)
     except NotThere:
         return None
     again = next((one for one in landed.found if one.camera == cameras[0]), None)

@@ -18,8 +18,8 @@ from calib.plan.placements import Placement
 from calib.survey.records import Approach, Sigma, Survey, SurveyCamera, SurveyImage
 from calib.survey.writer import BenchFolder, NotWritten
 from calib.targets.boards import AnyBoard
-from mastctl.bench.eyes import BenchLook, SeenBoard
 from mastctl.bench.frame import RoverFrame, frame_of
+from mastctl.bench.mast import BenchLook, SeenBoard
 from mastctl.json_lines import append_line
 
 JOURNAL = "bench.jsonl"

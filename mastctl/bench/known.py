@@ -20,9 +20,9 @@ from calib.plan.knowledge import BenchShot, BoardView, ExpectedPointing, Knowled
 from calib.plan.placements import FEWEST, body_cameras
 from calib.plan.poses import Sought, expected_px, readings, rover_from_board, shown, with_board
 from calib.targets.boards import AnyBoard
-from mastctl.bench.eyes import BenchHead, BenchLook
 from mastctl.bench.folder import RunFolder, looks_of
 from mastctl.bench.frame import FitSurvey, FittedBench
+from mastctl.bench.mast import BenchHead, BenchLook
 from mastctl.bench.reporter import CELLS
 from mastctl.calibration.landing import first_cameras
 

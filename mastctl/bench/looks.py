@@ -14,8 +14,8 @@ import numpy as np
 from calib.plan.knowledge import BenchShot
 from calib.plan.placements import Placement
 from calib.plan.poses import AttitudeChoice, next_shot
-from mastctl.bench.eyes import BenchEyes, BenchLook, NotThere
 from mastctl.bench.known import BenchKnowledge
+from mastctl.bench.mast import BenchLook, BenchMast, NotThere
 from mastctl.bench.reporter import BenchProgress, Reporter
 from mastctl.bench.search import find_board
 from mastctl.errors import MastctlError
@@ -63,8 +63,8 @@ class BoardLost(MastctlError):
 class Looks:
     """Looks at boards through a head's cameras, of which ``known`` learns."""
 
-    def __init__(self, eyes: BenchEyes, known: BenchKnowledge, reporter: Reporter, wanted: BenchGoal) -> None:
-        self._eyes, self._known, self._reporter, self._wanted = eyes, known, reporter, wanted
+    def __init__(self, mast: BenchMast, known: BenchKnowledge, reporter: Reporter, wanted: BenchGoal) -> None:
+        self._mast, self._known, self._reporter, self._wanted = mast, known, reporter, wanted
         self.here = ""
         """The placement that was worked at, and whose board so stands there."""
 
@@ -72,7 +72,7 @@ class Looks:
         """Look for a board that was placed anew. Raises BoardNotFound."""
         self._reporter.step("search")
         known = self._known
-        known.take(name, find_board(self._eyes, known.now, known.sought, self._reporter, placement))
+        known.take(name, find_board(self._mast, known.now, known.sought, self._reporter, placement))
 
     def work_at(self, name: str, most: int) -> None:
         """Take what tells most of a board that was found, ``most`` looks or until others tell more.
@@ -135,7 +135,7 @@ class Looks:
     def _look(self, where: BenchShot | BenchLook, cameras: Collection[str]) -> BenchLook:
         at = where.pan_rad, where.tilt_rad, (where.pan_approach, where.tilt_approach)
         every = len(cameras) == len(self._known.head.rig.cameras)
-        return self._eyes.look(*at) if every else self._eyes.look(*at, cameras)
+        return self._mast.look(*at) if every else self._mast.look(*at, cameras)
 
     def _suffices(self, here: int, choice: AttitudeChoice) -> bool:
         if here < FEWEST_LOOKS:

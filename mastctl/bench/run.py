@@ -16,12 +16,12 @@ from calib.plan.placements import Advice, Placement, advise, advise_for_body, fi
 from calib.survey.records import Sigma
 from calib.targets.boards import AnyBoard
 from mastctl.bench.check import Checked, point_at_corners, unvisited
-from mastctl.bench.daemon_eyes import DaemonEyes
-from mastctl.bench.eyes import BenchEyes
+from mastctl.bench.daemon_mast import DaemonMast
 from mastctl.bench.folder import RunFolder
 from mastctl.bench.frame import FitSurvey, FittedBench, RoverFrame, fit_in_rover, frame_of
 from mastctl.bench.known import BenchKnowledge
 from mastctl.bench.looks import FEWEST_LOOKS, BenchGoal, Looks, deg
+from mastctl.bench.mast import BenchMast
 from mastctl.bench.reporter import Reporter
 from mastctl.bench.simulated import SimulatedBoard
 from mastctl.client import Client
@@ -37,7 +37,7 @@ class BenchRun:
 
     def __init__(
         self,
-        eyes: BenchEyes,
+        mast: BenchMast,
         kept: RunFolder,
         board: AnyBoard,
         reporter: Reporter,
@@ -45,10 +45,10 @@ class BenchRun:
         wanted: BenchGoal,
         simulated: SimulatedBoard | None = None,
     ) -> None:
-        self.wanted, self._eyes, self._reporter, self._kept = wanted, eyes, reporter, kept
+        self.wanted, self._mast, self._reporter, self._kept = wanted, mast, reporter, kept
         self._simulated = simulated
-        self.known = BenchKnowledge(eyes.head, kept, board, fit, reporter.say)
-        self._looks = Looks(eyes, self.known, reporter, wanted)
+        self.known = BenchKnowledge(mast.head, kept, board, fit, reporter.say)
+        self._looks = Looks(mast, self.known, reporter, wanted)
 
     def run(self) -> FittedBench:
         """Take pictures until they suffice, and return the fit of all of them.
@@ -98,7 +98,7 @@ class BenchRun:
                 known.take(name, look, check=True)
         checks = known.of(name, check=True)
         pointings = []
-        for pointing in point_at_corners(self._eyes, known, name, checks):
+        for pointing in point_at_corners(self._mast, known, name, checks):
             self._reporter.say(pointing.sentence())
             pointings.append(pointing)
         return Checked(known.promised_px(checks, name), tuple(pointings))
@@ -189,11 +189,11 @@ def open_run(
         If the daemon refuses a question.
     """
     status = client.status()
-    eyes = DaemonEyes(client, cameras or list(status["cameras"]), board)
-    head = eyes.head
+    mast = DaemonMast(client, cameras or list(status["cameras"]), board)
+    head = mast.head
     sigma = Sigma(0.0, 0.0, joint_rad=head.count_rad / 12**0.5, corner_px=0.1)
     kept = RunFolder(folder, board, sigma, head.rig)
     kept.begin(client.mast_file(), frame or RoverFrame())
     fit = fit_in_rover(frame_of(kept.notes), head.rig, kept.moved)
     simulated = SimulatedBoard(client, board, head.rig) if status["simulated"] else None
-    return BenchRun(eyes, kept, board, reporter, fit, wanted, simulated)
+    return BenchRun(mast, kept, board, reporter, fit, wanted, simulated)

@@ -13,7 +13,7 @@ from calib.geometry.rig import Rig
 from calib.plan.knowledge import Knowledge
 from calib.plan.placements import Placement
 from calib.plan.poses import Sought, readings
-from mastctl.bench.eyes import BenchEyes, BenchLook, NoLight, NotThere
+from mastctl.bench.mast import BenchLook, BenchMast, NoLight, NotThere
 from mastctl.bench.reporter import Reporter
 from mastctl.errors import MastctlError
 
@@ -42,7 +42,7 @@ class BoardNotFound(MastctlError):
 
 
 def find_board(
-    eyes: BenchEyes, known: Knowledge, sought: Sought, reporter: Reporter, placement: Placement
+    mast: BenchMast, known: Knowledge, sought: Sought, reporter: Reporter, placement: Placement
 ) -> BenchLook:
     """Return the first look that shows the board: where it should stand, then ever further around it.
 
@@ -58,7 +58,7 @@ def find_board(
     instead = _Instead()
     for at_rad in attitudes:
         try:
-            look = eyes.look(*at_rad)
+            look = mast.look(*at_rad)
         except NotThere as reason:
             instead.add([str(reason)], at_rad)
             continue

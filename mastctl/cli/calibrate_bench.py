@@ -146,8 +146,8 @@ def _drive(args: argparse.Namespace) -> Answer:
     from calib.calibrate.starts.bench import BenchNotFitted
     from calib.survey.writer import NotWritten
     from calib.targets.board_file import load_board
-    from mastctl.bench.eyes import BenchInterrupted
     from mastctl.bench.looks import BoardLost
+    from mastctl.bench.mast import BenchInterrupted
     from mastctl.bench.reporter import NoOperator
     from mastctl.bench.result import finish
     from mastctl.bench.search import BoardNotFound
@@ -233,8 +233,8 @@ class Terminal:
 @contextmanager
 def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple[BenchRun, Reporter]]:
     """A run on a daemon that runs, or on one that is started for it, under a lease."""
-    from mastctl.bench.eyes import BenchInterrupted
     from mastctl.bench.looks import BenchGoal
+    from mastctl.bench.mast import BenchInterrupted
     from mastctl.bench.run import open_run
     from mastctl.client import ClientError
 

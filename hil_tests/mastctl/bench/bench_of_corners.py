@@ -16,7 +16,7 @@ from calib.geometry.rigid import FloatArray, Rigid
 from calib.plan.placements import Placement
 from calib.targets.boards import AnyBoard, Corners
 from hil_tests.support.sim_survey.plan import rover_from_head
-from mastctl.bench.eyes import BenchHead, BenchLook, SeenBoard
+from mastctl.bench.mast import BenchHead, BenchLook, SeenBoard
 
 EDGE_PX = 3.0
 FLATTEST = math.cos(math.radians(72.0))
@@ -52,7 +52,7 @@ class TrueAxis:
 
 @dataclass
 class CornerBench:
-    """Eyes whose pictures are corners.
+    """A mast whose pictures are corners.
 
     Attributes
     ----------
@@ -96,7 +96,7 @@ class CornerBench:
         approach: tuple[int, int] = (0, 0),
         cameras: Collection[str] | None = None,
     ) -> BenchLook:
-        """See `mastctl.bench.eyes.BenchEyes`."""
+        """See `mastctl.bench.mast.BenchMast`."""
         begun = self.pan.read_rad, self.tilt.read_rad
         for axis, wanted, side in ((self.pan, pan_rad, approach[0]), (self.tilt, tilt_rad, approach[1])):
             if side:

@@ -14,10 +14,10 @@ from calib.geometry.rig import Rig
 from calib.survey.records import Sigma
 from calib.targets.boards import Charuco
 from hil_tests.mastctl.bench.bench_of_corners import CornerBench, SelfPlacing, TrueAxis
-from mastctl.bench.eyes import BenchEyes, BenchHead
 from mastctl.bench.folder import RunFolder
 from mastctl.bench.frame import RoverFrame, fit_in_rover
 from mastctl.bench.looks import BenchGoal
+from mastctl.bench.mast import BenchHead, BenchMast
 from mastctl.bench.reporter import Reporter
 from mastctl.bench.run import BenchRun
 
@@ -67,12 +67,12 @@ def run_of(
     bench: CornerBench,
     folder: Path,
     wanted: BenchGoal | None = None,
-    eyes: BenchEyes | None = None,
+    mast: BenchMast | None = None,
     reporter: Reporter | None = None,
 ) -> tuple[BenchRun, SelfPlacing]:
-    """A run, and who places the board for it; ``eyes`` and ``reporter`` instead of the bench's own."""
+    """A run, and who places the board for it; ``mast`` and ``reporter`` instead of the bench's own."""
     person = SelfPlacing(bench)
     kept = kept_in(folder, bench)
     fit = fit_in_rover(RoverFrame(), bench.head.rig, kept.moved)
-    run = BenchRun(eyes or bench, kept, BOARD, reporter or person, fit, wanted or BenchGoal())
+    run = BenchRun(mast or bench, kept, BOARD, reporter or person, fit, wanted or BenchGoal())
     return run, person

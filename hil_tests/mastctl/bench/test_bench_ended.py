@@ -26,8 +26,8 @@ from hil_tests.mastctl.bench.bench_of_corners import CornerBench
 from hil_tests.mastctl.bench.bench_world import corner_bench, run_of
 from hil_tests.mastctl.outside_daemon import write_config
 from hil_tests.mastctl.service_fakes import FakeHardware
-from mastctl.bench.eyes import BenchInterrupted, BenchLook, NoLight
 from mastctl.bench.folder import looks_of
+from mastctl.bench.mast import BenchInterrupted, BenchLook, NoLight
 from mastctl.bench.run import BenchRun
 from mastctl.bench.search import BoardNotFound, find_board
 from mastctl.cli import calibrate_bench

@@ -17,9 +17,9 @@ from calib.plan.placements import Placement
 from calib.survey.reader import read_survey
 from hil_tests.mastctl.bench.bench_of_corners import CornerBench
 from hil_tests.mastctl.bench.bench_world import corner_bench, run_of
-from mastctl.bench.eyes import BenchLook
 from mastctl.bench.folder import looks_of
 from mastctl.bench.looks import BoardLost
+from mastctl.bench.mast import BenchLook
 
 
 def test_a_bench_ends_by_itself_with_what_was_wanted_met_on_paper_and_kept(
@@ -83,7 +83,7 @@ class Dying(RuntimeError):
 
 
 class Mortal:
-    """Eyes that die after some looks."""
+    """A mast that dies after some looks."""
 
     def __init__(self, bench: CornerBench, looks: int) -> None:
         self.bench, self.left, self.head = bench, looks, bench.head
@@ -97,12 +97,12 @@ class Mortal:
 
 def test_a_run_that_died_goes_on_at_its_placement_without_asking(repository: Path, tmp_path: Path) -> None:
     bench = corner_bench(repository, seed=2)
-    run, _ = run_of(bench, tmp_path / "bench", eyes=Mortal(bench, 5))  # dies in the first placement
+    run, _ = run_of(bench, tmp_path / "bench", mast=Mortal(bench, 5))  # dies in the first placement
     with pytest.raises(Dying):
         run.run()
     run._kept.let_go()
     before = list(looks_of(read_survey(tmp_path / "bench")))
-    again, second = run_of(bench, tmp_path / "bench", eyes=Mortal(bench, 3))  # its end is that of any run
+    again, second = run_of(bench, tmp_path / "bench", mast=Mortal(bench, 3))  # its end is that of any run
     with pytest.raises(Dying):
         again.run()
     after = list(looks_of(read_survey(tmp_path / "bench")))

@@ -17,9 +17,9 @@ import pytest
 from calib.targets.boards import Charuco
 from hil_tests import forks
 from hil_tests.waiting import until
-from mastctl.bench import daemon_eyes
-from mastctl.bench.daemon_eyes import DaemonEyes, beside_goal
-from mastctl.bench.eyes import BenchInterrupted
+from mastctl.bench import daemon_mast
+from mastctl.bench.daemon_mast import DaemonMast, beside_goal
+from mastctl.bench.mast import BenchInterrupted
 from mastctl.client import Client
 
 BOARD = Charuco(10, 7, 0.055, 0.042)
@@ -58,8 +58,8 @@ def url(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(daemon_eyes, "PATIENCE_S", 0.2)
-    monkeypatch.setattr(daemon_eyes, "AGAIN_S", 0.05)
+    monkeypatch.setattr(daemon_mast, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(daemon_mast, "AGAIN_S", 0.05)
 
 
 def in_the_move(url: str, act: Callable[[Client], object]) -> threading.Thread:
@@ -78,10 +78,10 @@ def in_the_move(url: str, act: Callable[[Client], object]) -> threading.Thread:
 def far_look(url: str, act: Callable[[Client], object]) -> str:
     """What a look says in the middle of whose move something is done."""
     with Client(url, name="bench") as client, client.lease(name="calibrate bench"):
-        eyes = DaemonEyes(client, ("navcam_left",), BOARD)
+        mast = DaemonMast(client, ("navcam_left",), BOARD)
         thread = in_the_move(url, act)
         with pytest.raises(BenchInterrupted) as told:
-            eyes.look(FAR_RAD, 0.0)
+            mast.look(FAR_RAD, 0.0)
         thread.join()
         return str(told.value)
 
@@ -102,14 +102,14 @@ def test_a_lease_that_is_taken_stops_the_move_and_no_other_begins(url: str) -> N
         Client(url, name="bench") as client,
         client.lease(name="calibrate bench"),
     ):
-        eyes = DaemonEyes(client, ("navcam_left",), BOARD)
+        mast = DaemonMast(client, ("navcam_left",), BOARD)
         move = client.point(pan_rad=FAR_RAD, tilt_rad=0.0)
         until(lambda: ana.status()["moving"], "the head turns")
         with (
             ana.lease("Ana", take_over="the head is needed"),
             pytest.raises(BenchInterrupted, match="Ana took over: the head is needed"),
         ):
-            eyes.look(-FAR_RAD, 0.0)
+            mast.look(-FAR_RAD, 0.0)
         assert ana.wait(move)["state"] == "stopped"
 
 
@@ -119,24 +119,24 @@ def test_a_stop_between_two_moves_ends_it_and_is_told(url: str) -> None:
         Client(url, name="bench") as client,
         client.lease(name="calibrate bench", ends_with_stop=True),
     ):
-        eyes = DaemonEyes(client, ("navcam_left",), BOARD)
+        mast = DaemonMast(client, ("navcam_left",), BOARD)
         here = ana.status()["joints"]
         assert here is not None
         client.wait(client.point(pan_rad=here["pan_rad"] + 0.01, tilt_rad=here["tilt_rad"]))
         ana.stop()
         stands = ana.status()["joints"]
         with pytest.raises(BenchInterrupted, match=r"^the head was stopped by Ana$"):
-            eyes.look(FAR_RAD, 0.0)
+            mast.look(FAR_RAD, 0.0)
         now = ana.status()["joints"]
         assert stands is not None and now is not None and now["pan_rad"] == stands["pan_rad"]
 
 
 def test_a_move_that_outlasts_its_time_is_stopped(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(daemon_eyes, "TURN_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(daemon_mast, "TURN_TIMEOUT_S", 0.5)
     with Client(url, name="bench") as client, client.lease(name="calibrate bench"):
-        eyes = DaemonEyes(client, ("navcam_left",), BOARD)
+        mast = DaemonMast(client, ("navcam_left",), BOARD)
         with pytest.raises(BenchInterrupted, match=r"did not end in the 0\.5 s"):
-            eyes.look(FAR_RAD, 0.0)
+            mast.look(FAR_RAD, 0.0)
         until(lambda: not client.status()["moving"], "the head has come to rest")
         joints = client.status()["joints"]
     assert joints is not None and joints["pan_rad"] < FAR_RAD - 0.2
@@ -144,12 +144,12 @@ def test_a_move_that_outlasts_its_time_is_stopped(url: str, monkeypatch: pytest.
 
 def test_ctrl_c_in_the_middle_of_a_move_leaves_no_head_behind_that_turns(url: str) -> None:
     with Client(url, name="bench") as client, client.lease(name="calibrate bench"):
-        eyes = DaemonEyes(client, ("navcam_left",), BOARD)
+        mast = DaemonMast(client, ("navcam_left",), BOARD)
         main = threading.main_thread().ident
         assert main is not None
         thread = in_the_move(url, lambda ana: signal.pthread_kill(main, signal.SIGINT))
         with pytest.raises(KeyboardInterrupt):
-            eyes.look(FAR_RAD, 0.0)
+            mast.look(FAR_RAD, 0.0)
         thread.join()
     with Client(url) as other:
         until(lambda: not other.status()["moving"], "the head has come to rest")

@@ -18,7 +18,7 @@ export class Bench {
     this.kept = [];
     this.build();
     this.heard = 0; // what is pushed is newer than any answer that was under way meanwhile
-    events.addEventListener("bench", (event) => { this.heard += 1; this.told(event.detail.value); });
+    events.addEventListener("bench", (event) => { this.heard += 1; this.update(event.detail.value); });
     events.addEventListener("connected", () => this.look());
     events.addEventListener("mast", (event) => { this.inUse = event.detail.value.file; this.later(); });
   }
@@ -85,7 +85,7 @@ export class Bench {
     }
   }
 
-  told(run) {
+  update(run) {
     const before = this.run;
     this.run = run;
     if (run.name !== before?.name || run.state !== before.state || run.asked?.name !== before.asked?.name) {
@@ -113,7 +113,7 @@ export class Bench {
       const { run } = await post("/bench", body);
       held.lease = null; // it steers from now on
       this.closed = null;
-      if (heard === this.heard) this.told(run);
+      if (heard === this.heard) this.update(run);
     });
   }
 
@@ -154,7 +154,7 @@ export class Bench {
     this.fresh.hidden = !over;
     this.drawSteps(run);
     this.drawPlace(run);
-    put(this.seen, Object.entries(run.cameras).map(([name, told]) => coverage(name, told)));
+    put(this.seen, Object.entries(run.cameras).map(([name, image]) => coverage(name, image)));
     this.cover.hidden = !Object.keys(run.cameras).length;
     this.drawError(run);
     this.drawVerdict(run);

@@ -59,12 +59,12 @@ export function asSeen(asked, size) {
 }
 
 /** Which parts of a camera's picture have seen corners. */
-export function coverage(name, told) {
-  const [width, height] = told.size_px;
-  const seen = told.cells.filter((count) => count > 0).length;
-  const most = Math.max(12, ...told.cells);
-  const shown = told.cells.map((count, k) => s("rect", { class: count ? "cell" : "unseen", x: (k % 8) * 20 + 1, y: Math.floor(k / 8) * 20 + 1, width: 18, height: 18, "fill-opacity": count ? (0.3 + (0.7 * Math.log1p(count)) / Math.log1p(most)).toFixed(2) : 1 }));
-  const part = Math.round((100 * seen) / told.cells.length);
+export function coverage(name, image) {
+  const [width, height] = image.size_px;
+  const seen = image.cells.filter((count) => count > 0).length;
+  const most = Math.max(12, ...image.cells);
+  const shown = image.cells.map((count, k) => s("rect", { class: count ? "cell" : "unseen", x: (k % 8) * 20 + 1, y: Math.floor(k / 8) * 20 + 1, width: 18, height: 18, "fill-opacity": count ? (0.3 + (0.7 * Math.log1p(count)) / Math.log1p(most)).toFixed(2) : 1 }));
+  const part = Math.round((100 * seen) / image.cells.length);
   return h("figure", { class: "coverage" },
     s("svg", { viewBox: "0 0 160 120", style: null, preserveAspectRatio: "none", class: width < height ? "upright" : null, role: "img", "aria-label": `${called(name)}: corners were seen in ${part} percent of its picture` }, shown),
     h("figcaption", {}, h("strong", {}, called(name)), ` ${part} % seen`));

@@ -1,4 +1,4 @@
-"""A bench's eyes on a whole daemon: what it is told when something is pulled out, dark, stopped or taken."""
+"""A bench's mast on a whole daemon: what it is told when something is pulled out, dark, stopped or taken."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from calib.geometry.mode import SensorMode
 from calib.geometry.rig import AxisJoint, JointErrors
 from calib.plan.placements import Placement
 from calib.targets.boards import Charuco
-from mastctl.bench import daemon_eyes
-from mastctl.bench.daemon_eyes import DaemonEyes
-from mastctl.bench.eyes import BenchInterrupted, NoLight, NotThere
+from mastctl.bench import daemon_mast
+from mastctl.bench.daemon_mast import DaemonMast
 from mastctl.bench.folder import survey_cameras
+from mastctl.bench.mast import BenchInterrupted, NoLight, NotThere
 from mastctl.bench.simulated import SimulatedBoard
 from mastctl.client import Client
 from mastctl.config import Config, Listen, load_config
@@ -41,27 +41,27 @@ def client(repository: Path) -> Iterator[Client]:
 
 
 @pytest.fixture
-def eyes(client: Client, monkeypatch: pytest.MonkeyPatch) -> Iterator[DaemonEyes]:
-    monkeypatch.setattr(daemon_eyes, "PATIENCE_S", 0.2)
-    monkeypatch.setattr(daemon_eyes, "AGAIN_S", 0.05)
-    eyes = DaemonEyes(client, CAMERAS, BOARD)
-    SimulatedBoard(client, BOARD, eyes.head.rig).stand(Placement(1.2, 0.0, 0.0, (15.0, 0.0)))
-    yield eyes
+def mast(client: Client, monkeypatch: pytest.MonkeyPatch) -> Iterator[DaemonMast]:
+    monkeypatch.setattr(daemon_mast, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(daemon_mast, "AGAIN_S", 0.05)
+    mast = DaemonMast(client, CAMERAS, BOARD)
+    SimulatedBoard(client, BOARD, mast.head.rig).stand(Placement(1.2, 0.0, 0.0, (15.0, 0.0)))
+    yield mast
     client.clear_faults()
 
 
-def test_a_look_shows_the_board_with_one_reading_and_describes_the_head(eyes: DaemonEyes) -> None:
-    assert eyes.head.one_sided and eyes.head.count_rad == pytest.approx(5.6e-5, rel=0.01)
-    left = eyes.head.rig.cameras["navcam_left"]
+def test_a_look_shows_the_board_with_one_reading_and_describes_the_head(mast: DaemonMast) -> None:
+    assert mast.head.one_sided and mast.head.count_rad == pytest.approx(5.6e-5, rel=0.01)
+    left = mast.head.rig.cameras["navcam_left"]
     whole = SensorMode(left.model.size_px, (0, 0, *left.model.size_px), left.model.size_px)
     assert left.sensor_mode == whole
-    kept = survey_cameras(eyes.head.rig)
+    kept = survey_cameras(mast.head.rig)
     assert kept["navcam_left"].sensor_mode == whole
-    look = eyes.look(0.05, -0.02)
+    look = mast.look(0.05, -0.02)
     assert [one.camera for one in look.found] == list(CAMERAS)
     assert look.pan_rad == pytest.approx(0.05, abs=1e-4) and look.seconds > 0.0
     assert all(one.corners is not None and len(one.corners) > 20 and one.data for one in look.found)
-    assert eyes.look(0.05, -0.02, cameras=CAMERAS[1:]).cameras == CAMERAS[1:]
+    assert mast.look(0.05, -0.02, cameras=CAMERAS[1:]).cameras == CAMERAS[1:]
 
 
 def test_a_head_with_joints_in_its_file_is_turned_to_wanted_readings(
@@ -73,39 +73,39 @@ def test_a_head_with_joints_in_its_file_is_turned_to_wanted_readings(
     save_rig(rig, tmp_path / "waves.yaml")
     config = replace(config, mast_file=tmp_path / "waves.yaml")
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
-        look = DaemonEyes(client, CAMERAS, BOARD).look(0.05, -0.02)
+        look = DaemonMast(client, CAMERAS, BOARD).look(0.05, -0.02)
     assert (look.pan_rad, look.tilt_rad) == (pytest.approx(0.05, abs=1e-4), pytest.approx(-0.02, abs=1e-4))
 
 
 def test_a_camera_that_is_pulled_out_is_named_and_the_other_still_looks(
-    client: Client, eyes: DaemonEyes
+    client: Client, mast: DaemonMast
 ) -> None:
     client.set_fault("navcam_right", "off")
-    look = eyes.look(0.02, 0.0)
+    look = mast.look(0.02, 0.0)
     assert [one.camera for one in look.found] == ["navcam_left"]
     assert look.seen[1].why == "camera navcam_right gave no picture"
 
 
 def test_when_no_camera_gives_a_picture_the_bench_waits_and_then_says_so(
-    client: Client, eyes: DaemonEyes
+    client: Client, mast: DaemonMast
 ) -> None:
     for camera in CAMERAS:
         client.set_fault(camera, "off")
     with pytest.raises(BenchInterrupted, match="navcam"):
-        eyes.look(0.0, 0.0)
+        mast.look(0.0, 0.0)
     client.clear_faults()
-    assert eyes.look(0.0, 0.0).found  # and goes on
+    assert mast.look(0.0, 0.0).found  # and goes on
 
 
-def test_pictures_in_the_dark_say_that_they_are_dark(client: Client, eyes: DaemonEyes) -> None:
+def test_pictures_in_the_dark_say_that_they_are_dark(client: Client, mast: DaemonMast) -> None:
     client.set_fault("navcam_left", "dark")
-    look = eyes.look(0.0, 0.0)
+    look = mast.look(0.0, 0.0)
     assert look.seen[0].why.startswith("the picture is dark") and look.seen[1].corners
     client.set_fault("navcam_right", "dark")
     with pytest.raises(NoLight, match=r"navcam_left: the picture is dark.*; turn on a light"):
-        eyes.look(0.0, 0.0)  # elsewhere it may be light: a search goes on
+        mast.look(0.0, 0.0)  # elsewhere it may be light: a search goes on
 
 
-def test_beyond_the_limits_nothing_is_looked_at_and_nothing_ends(eyes: DaemonEyes) -> None:
+def test_beyond_the_limits_nothing_is_looked_at_and_nothing_ends(mast: DaemonMast) -> None:
     with pytest.raises(NotThere):
-        eyes.look(3.0, 0.0)
+        mast.look(3.0, 0.0)

@@ -89,7 +89,7 @@ class BenchHead:
     count_rad: float = 0.0
 
 
-class BenchEyes(Protocol):
+class BenchMast(Protocol):
     """A head with cameras in front of a board."""
 
     @property

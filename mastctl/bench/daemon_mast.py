@@ -17,7 +17,7 @@ from calib.geometry.mode import FLIPS, SensorMode
 from calib.geometry.rig import Rig
 from calib.targets.boards import AnyBoard, CornersNotFound
 from calib.targets.corners import find_corners
-from mastctl.bench.eyes import BenchHead, BenchInterrupted, BenchLook, NoLight, NotThere, SeenBoard
+from mastctl.bench.mast import BenchHead, BenchInterrupted, BenchLook, NoLight, NotThere, SeenBoard
 from mastctl.client import Client, ClientError, Snapshot
 
 TURN_TIMEOUT_S = 90.0
@@ -46,9 +46,9 @@ LASTING = frozenset(
 """What waiting does not mend: an operator has to act."""
 
 
-class DaemonEyes:
+class DaemonMast:
     """Looks for a board through some cameras of a daemon, whose lease ``client`` should have; see
-    `mastctl.bench.eyes.BenchEyes`."""
+    `mastctl.bench.mast.BenchMast`."""
 
     def __init__(self, client: Client, cameras: Sequence[str], board: AnyBoard) -> None:
         self._client, self._cameras, self._board = client, tuple(cameras), board
@@ -79,7 +79,7 @@ class DaemonEyes:
         approach: tuple[int, int] = (0, 0),
         cameras: Collection[str] | None = None,
     ) -> BenchLook:
-        """See `mastctl.bench.eyes.BenchEyes`.
+        """See `mastctl.bench.mast.BenchMast`.
 
         Raises BenchInterrupted if another client steers, a stop was pressed, the daemon is gone, or head or
         cameras fail for longer than a cable takes to be put back.
