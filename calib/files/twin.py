@@ -15,8 +15,6 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from calib.geometry.cahvor import COEFFICIENTS, FREE, CameraModel, Kind
 from calib.geometry.parameters import parameter_part, predict
@@ -254,6 +252,9 @@ def _fit(
     Unknown are a turn, the camera matrix (its skew if wanted), the lens and, if it may move, C. The lens is
     OpenCV's coefficients (of 14 k1 to k3, p1, p2 and the plane's turns), or O about A, R1, R2, a linearity.
     """
+    from scipy.optimize import least_squares  # slow to load, and a daemon that starts does not need it
+    from scipy.spatial.transform import Rotation
+
     rows = start.rotation if skew or start.kind in FREE else even_axes(start).T
     at = (0, 1, 0, 1, 0)[: 4 + skew], (0, 1, 2, 2, 1)[: 4 + skew]  # of the unknowns in the camera matrix
     used = [0, 1, 2, 3, 4, 12, 13] if start.kind == "OPENCV14" else list(range(len(start.distortion)))
