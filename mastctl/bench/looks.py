@@ -90,7 +90,7 @@ class Looks:
             choice = next_shot(known.now, known.sought, known.shots, name, known.aim, in_vain, ahead)
             if choice is None or here >= most or self._suffices(here, choice):
                 break
-            self._tell(name, choice)
+            self._report(name, choice)
             shot = choice.shot
             look = self.look_at(shot)
             if look is not None and look.found:
@@ -169,7 +169,7 @@ class Looks:
         camera = head.rig.cameras[self._known.workspace.cameras[0]].model
         return MOVED_PX + 3.0 * head.count_rad * float(np.linalg.norm(camera.H))
 
-    def _tell(self, name: str, choice: AttitudeChoice) -> None:
+    def _report(self, name: str, choice: AttitudeChoice) -> None:
         known = self._known
         self._reporter.progress(
             BenchProgress(

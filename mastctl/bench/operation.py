@@ -57,6 +57,7 @@ GOES_ON = "everything seen is kept, and the run can go on"
 
 def carry_out(job: BenchJob, link: Connection) -> None:
     """Do a job: only the worker's process loads what planning and fitting need."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C of the daemon's terminal is the daemon's
     from mastctl.bench.worker import work
 
     work(job, link)

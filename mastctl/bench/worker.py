@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import math
 import os
-import signal
 import threading
 from collections.abc import Mapping
 from multiprocessing.connection import Connection
@@ -39,7 +38,6 @@ MOST_ON_CURVE = 600
 
 def work(job: BenchJob, link: Connection) -> None:
     """Carry a run out. Sends it through ``link`` at each change; receives True when a board stands."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a Ctrl-C of the daemon's terminal is the daemon's
     os.nice(BESIDE)
     reporter = LinkReporter(job.run, link)
     try:
