@@ -22,7 +22,7 @@ from calib.targets.boards import FLAT, AnyBoard, Bow
 from calib.targets.pattern import pattern_of
 from drivers.errors import BadOptions
 from drivers.sim.placed import REACH_M, PlacedBoard
-from drivers.sim.render import DrawsPictures, camera_key, ray_table
+from drivers.sim.render import Draw, camera_key, ray_table
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -99,13 +99,13 @@ def placed_board(placed: PlacedBoard, ground_z_m: Callable[[float, float], float
 
 
 class BenchBoards:
-    """The renderer of a scene with boards in it; boards come and go while it runs. Safe from any thread.
+    """Boards over the pictures of a scene; they come and go while it runs. Safe from any thread.
 
-    ``placed`` are boards that stay.
+    ``image`` draws the scene; ``placed`` are boards that stay.
     """
 
-    def __init__(self, renderer: DrawsPictures, placed: Sequence[BenchBoard] = ()) -> None:
-        self._renderer = renderer
+    def __init__(self, image: Draw, placed: Sequence[BenchBoard] = ()) -> None:
+        self._scene_image = image
         self._placed = tuple(placed)
         self._lock = threading.Lock()
         self._boards: Mapping[str, BenchBoard] = MappingProxyType({})
@@ -131,7 +131,7 @@ class BenchBoards:
     ) -> Float32:
         """Return the picture of the scene with the boards over it, as `drivers.sim.render.Renderer.image`."""
         boards = (*self._placed, *self._boards.values())
-        image = self._renderer.image(camera, site_from_camera_frame, samples, rows)
+        image = self._scene_image(camera, site_from_camera_frame, samples, rows)
         if not boards:
             return image
         camera_m = site_from_camera_frame.points(camera.C)
@@ -160,10 +160,6 @@ class BenchBoards:
             along = np.where((np.abs(hits) <= board.half_size_m).all(axis=-1), along, np.nan)
             found = np.fmin(found, along)
         return np.asarray(found.reshape(ranges_m.shape))
-
-    def close(self) -> None:
-        """Close the scene's own renderer."""
-        self._renderer.close()
 
     def _draw(
         self, image: Float32, camera: CameraModel, to_board: Rigid, board: BenchBoard, rows: tuple[int, int]

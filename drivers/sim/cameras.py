@@ -116,10 +116,9 @@ class SimulatedCamera(Camera):
         self._rounding_s = 1e-9 if settings.row_time_s or settings.exposure.auto else 0.0
         self._exposure: FixedExposure | AutoExposure
         if settings.exposure.auto and metered is not None:
-            first_s, now_s = self._epochs[0].start_s, clock.now_s
-            self._exposure = AutoExposure(settings.exposure, settings.exposure_s, first_s, metered, now_s)
+            self._exposure = AutoExposure(settings.exposure, settings.exposure_s, metered, clock.now_s)
         else:
-            self._exposure = FixedExposure(settings.exposure, settings.exposure_s, start_s)
+            self._exposure = FixedExposure(settings.exposure, settings.exposure_s)
         self._sensor_mode = sensor_mode
         self._closed = threading.Event()
         self._changed = clock.signal()

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, TypeVar, cast
 
 import numba
 import numpy as np
-from numba.core import cgutils
+from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
@@ -123,61 +123,42 @@ class World(NamedTuple):
     sun: Float64
 
 
-def _borrowed(_context: Any, array: Any) -> Any:
-    """Return the array without its owner, so that passing it on counts no references.
+class Ray(NamedTuple):
+    """A point and a unit direction in the site frame (z down), unless a function says otherwise."""
+
+    x: float
+    y: float
+    z: float
+    dx: float
+    dy: float
+    dz: float
+
+
+def _borrowed(_context: Any, value: Any) -> Any:
+    """Return an array, or tuples of arrays, without owners, so that passing it on counts no references.
 
     The counts are atomic: with them a picture takes two to three times as long. The caller keeps the owner.
     """
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        proxy = numba_structs.create_struct_proxy(signature.return_type)(context, builder, value=arguments[0])
-        proxy.meminfo = numba_structs.get_null_value(proxy.meminfo.type)
-        return proxy._getvalue()
+    def without_owner(context: Any, builder: Any, kind: Any, part: Any) -> Any:
+        if isinstance(kind, types.BaseTuple):
+            for index, inside in enumerate(kind.types):
+                freed = without_owner(context, builder, inside, builder.extract_value(part, index))
+                part = builder.insert_value(part, freed, index)
+        elif isinstance(kind, types.Array):
+            proxy = numba_structs.create_struct_proxy(kind)(context, builder, value=part)
+            proxy.meminfo = numba_structs.get_null_value(proxy.meminfo.type)
+            part = proxy._getvalue()
+        return part
 
-    return array(array), generate
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return without_owner(context, builder, signature.return_type, arguments[0])
+
+    return value(value), generate
 
 
 numba_structs: Any = cgutils
 borrowed = cast(Callable[[Any], Any], intrinsic(_borrowed))
-
-
-@part
-def borrowed_grid(grid: Grid) -> Grid:
-    """The grid without owners."""
-    return Grid(
-        borrowed(grid.elevation_m),
-        borrowed(grid.peaks_m),
-        borrowed(grid.peak_start),
-        grid.cells,
-        grid.levels,
-        grid.cell_m,
-        grid.x0_m,
-        grid.y0_m,
-        grid.lowest_m,
-        grid.highest_m,
-    )
-
-
-@part
-def borrowed_rocks(rocks: Rocks) -> Rocks:
-    """The rocks without owners."""
-    return Rocks(
-        borrowed(rocks.spheres_m),
-        borrowed(rocks.boxes_a),
-        borrowed(rocks.boxes_b),
-        borrowed(rocks.boxes_c),
-        borrowed(rocks.corners_m),
-        borrowed(rocks.normals),
-        borrowed(rocks.tones),
-    )
-
-
-@part
-def borrowed_texture(texture: Texture) -> Texture:
-    """The texture without owners."""
-    return Texture(
-        borrowed(texture.texels), borrowed(texture.start), texture.size, texture.levels, texture.texel_m
-    )
 
 
 # Rays and beams of rays against a heightfield of triangles, one by one or a block of pixels together.
@@ -198,20 +179,17 @@ What a ray met, it met at met_a / met_b metres; met_b is 0 as long as it met not
 
 
 @inlined
-def cell_crossing(
-    grid: Grid,
-    ix: int,
-    iy: int,
-    s0: float,
-    s1: float,
-    px: float,
-    py: float,
-    e: float,
-    dx: float,
-    dy: float,
-    de: float,
-) -> float:
-    """Where between s0 and s1 the ray enters cell (ix, iy), FAR if nowhere; px, py, dx, dy in cells."""
+def in_cells(grid: Grid, ray: Ray) -> Ray:
+    """Return a ray with x and y in cells of the grid, as the walk goes."""
+    scale = 1.0 / grid.cell_m
+    x, y = (ray.x - grid.x0_m) * scale, (ray.y - grid.y0_m) * scale
+    return Ray(x, y, ray.z, ray.dx * scale, ray.dy * scale, ray.dz)
+
+
+@inlined
+def cell_crossing(grid: Grid, ix: int, iy: int, ray: Ray, s0: float, s1: float) -> float:
+    """Where between s0 and s1 a ray in cells enters cell (ix, iy), FAR if nowhere."""
+    px, py, e, dx, dy, de = ray.x, ray.y, -ray.z, ray.dx, ray.dy, -ray.dz
     h00 = float(grid.elevation_m[iy, ix])
     h10 = float(grid.elevation_m[iy, ix + 1])
     h01 = float(grid.elevation_m[iy + 1, ix])
@@ -243,21 +221,12 @@ def cell_crossing(
 
 
 @inlined
-def walk(
-    grid: Grid,
-    px: float,
-    py: float,
-    e: float,
-    dx: float,
-    dy: float,
-    de: float,
-    start: float,
-    end: float,
-) -> tuple[float, int, int]:
-    """First crossing from above between ``start``, over the grid, and ``end``; px, py, dx, dy in cells.
+def walk(grid: Grid, ray: Ray, start: float, end: float) -> tuple[float, int, int]:
+    """First crossing from above of a ray in cells between ``start``, over the grid, and ``end``.
 
     Goes from block to block of cells, skipping one when the ray stays above its highest corner.
     """
+    px, py, e, dx, dy, de = ray.x, ray.y, -ray.z, ray.dx, ray.dy, -ray.dz
     n = grid.cells
     inv_dx = 1.0 / dx if dx != 0.0 else FAR
     inv_dy = 1.0 / dy if dy != 0.0 else FAR
@@ -279,7 +248,7 @@ def walk(
                 level -= 1
                 continue
         else:
-            hit = cell_crossing(grid, ix, iy, s, s_out, px, py, e, dx, dy, de)
+            hit = cell_crossing(grid, ix, iy, ray, s, s_out)
             if hit < FAR:
                 return hit, ix, iy
         if s_out >= end:
@@ -301,13 +270,12 @@ def walk(
 
 
 @part
-def cross_grid(
-    grid: Grid, ox: float, oy: float, oe: float, dx: float, dy: float, de: float, start: float, end: float
-) -> tuple[float, int, int]:
+def cross_grid(grid: Grid, ray: Ray, start: float, end: float) -> tuple[float, int, int]:
     """First crossing from above of a ray with the grid between ``start`` and ``end`` metres: (s, ix, iy).
 
     s is FAR for a miss. The ray may begin and end outside the grid.
     """
+    oe, de = -ray.z, -ray.dz
     if de >= 0.0 and oe > grid.highest_m:
         return FAR, 0, 0
     if de > 0.0:
@@ -316,12 +284,8 @@ def cross_grid(
         end = min(end, (grid.lowest_m - 1e-6 - oe) / de)
         start = max(start, (grid.highest_m + 1e-9 - oe) / de)
     n = grid.cells
-    inv_cell = 1.0 / grid.cell_m
-    px = (ox - grid.x0_m) * inv_cell
-    py = (oy - grid.y0_m) * inv_cell
-    dx *= inv_cell
-    dy *= inv_cell
-    for p, d in ((px, dx), (py, dy)):
+    ray = in_cells(grid, ray)
+    for p, d in ((ray.x, ray.dx), (ray.y, ray.dy)):
         if d != 0.0:
             near, far = -p / d, (n - p) / d
             start, end = max(start, min(near, far)), min(end, max(near, far))
@@ -329,77 +293,51 @@ def cross_grid(
             return FAR, 0, 0
     if start >= end:
         return FAR, 0, 0
-    return walk(grid, px, py, oe, dx, dy, de, start, end)
+    return walk(grid, ray, start, end)
 
 
 @inlined
-def cross_from_inside(
-    grid: Grid, ox: float, oy: float, oe: float, dx: float, dy: float, de: float, start: float
-) -> tuple[float, int, int]:
-    """As `cross_grid`, for a ray that is over the grid at ``start``: no look at the grid's sides."""
+def cross_from_inside(grid: Grid, ray: Ray, start: float) -> tuple[float, int, int]:
+    """As `cross_grid`, for a ray that is over the grid at ``start``: the grid's sides are not tested."""
     end = FAR
+    oe, de = -ray.z, -ray.dz
     if de >= 0.0:
         if oe + start * de > grid.highest_m:
             return FAR, 0, 0
         if de > 0.0:
             end = (grid.highest_m - oe) / de
-    inv_cell = 1.0 / grid.cell_m
-    px = (ox - grid.x0_m) * inv_cell
-    py = (oy - grid.y0_m) * inv_cell
-    return walk(grid, px, py, oe, dx * inv_cell, dy * inv_cell, de, start, end)
+    return walk(grid, in_cells(grid, ray), start, end)
 
 
 @entry
 def over_ground(grid: Grid, x: float, y: float, e: float) -> bool:
     """Whether a point is over the grid's square and above its triangles."""
-    px, py = (x - grid.x0_m) / grid.cell_m, (y - grid.y0_m) / grid.cell_m
-    if not (0.0 <= px < grid.cells and 0.0 <= py < grid.cells):
+    ray = in_cells(grid, Ray(x, y, -e, 0.0, 0.0, 0.0))
+    if not (0.0 <= ray.x < grid.cells and 0.0 <= ray.y < grid.cells):
         return False
-    ix, iy = int(px), int(py)
-    return cell_crossing(grid, ix, iy, 0.0, 0.0, px, py, e, 0.0, 0.0, 0.0) == FAR
+    return cell_crossing(grid, int(ray.x), int(ray.y), ray, 0.0, 0.0) == FAR
 
 
 @part
-def cross_outer(
-    inner: Grid,
-    outer: Grid,
-    ox: float,
-    oy: float,
-    oe: float,
-    dx: float,
-    dy: float,
-    de: float,
-    start: float,
-) -> tuple[float, int, int]:
+def cross_outer(inner: Grid, outer: Grid, ray: Ray, start: float) -> tuple[float, int, int]:
     """First crossing with the outer grid, after ``start`` and after leaving the inner one's square."""
     half = inner.cells * inner.cell_m * 0.5
     leave = FAR
-    if dx != 0.0:
-        leave = min(leave, (inner.x0_m + half + math.copysign(half, dx) - ox) / dx)
-    if dy != 0.0:
-        leave = min(leave, (inner.y0_m + half + math.copysign(half, dy) - oy) / dy)
-    return cross_grid(outer, ox, oy, oe, dx, dy, de, max(leave, start), FAR)
+    if ray.dx != 0.0:
+        leave = min(leave, (inner.x0_m + half + math.copysign(half, ray.dx) - ray.x) / ray.dx)
+    if ray.dy != 0.0:
+        leave = min(leave, (inner.y0_m + half + math.copysign(half, ray.dy) - ray.y) / ray.dy)
+    return cross_grid(outer, ray, max(leave, start), FAR)
 
 
 @part
-def clear_distance(
-    grid: Grid,
-    ox: float,
-    oy: float,
-    oe: float,
-    dx: float,
-    dy: float,
-    de: float,
-    spread: float,
-    rho: float,
-    start: float,
-    step: float,
-) -> float:
+def clear_distance(grid: Grid, ray: Ray, spread: float, rho: float, start: float, step: float) -> float:
     """How far a whole beam of rays is clear of the ground, from below rather than above.
 
     Every ray of the beam keeps within rho + s * spread of the central ray's point at s. Begins at ``start``,
     known to be clear, with steps of ``step`` metres; stops at the edge of the grid.
     """
+    ox, oy, oe, dx, dy, de = ray.x, ray.y, -ray.z, ray.dx, ray.dy, -ray.dz
     n = grid.cells
     inv_cell = 1.0 / grid.cell_m
     level_flat = math.sqrt(dx * dx + dy * dy)
@@ -544,19 +482,9 @@ def sweep(
 
 
 @inlined
-def meets_box(
-    boxes: Float64,
-    k: int,
-    i: int,
-    ox: float,
-    oy: float,
-    oz: float,
-    ix: float,
-    iy: float,
-    iz: float,
-    limit: float,
-) -> bool:
-    """Whether a ray (origin, 1 / direction) meets box i of rock k before ``limit``."""
+def meets_box(boxes: Float64, k: int, i: int, ray: Ray, limit: float) -> bool:
+    """Whether a ray, its direction given as 1 / direction, meets box i of rock k before ``limit``."""
+    ox, oy, oz, ix, iy, iz = ray
     a, b = (boxes[k, i, 0] - ox) * ix, (boxes[k, i, 3] - ox) * ix
     near, far = min(a, b), max(a, b)
     a, b = (boxes[k, i, 1] - oy) * iy, (boxes[k, i, 4] - oy) * iy
@@ -567,10 +495,9 @@ def meets_box(
 
 
 @inlined
-def meets_triangle(
-    corners: Float64, k: int, t: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float
-) -> tuple[float, float, float]:
+def meets_triangle(corners: Float64, k: int, t: int, ray: Ray) -> tuple[float, float, float]:
     """Möller and Trumbore's test: (s, weight of corner 1, weight of corner 2); s is FAR for a miss."""
+    ox, oy, oz, dx, dy, dz = ray
     e1x, e1y, e1z = (
         corners[k, t, 1, 0] - corners[k, t, 0, 0],
         corners[k, t, 1, 1] - corners[k, t, 0, 1],
@@ -599,39 +526,37 @@ def meets_triangle(
 
 
 @inlined
-def meets_ball(
-    balls: Float64, k: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, limit: float
-) -> bool:
+def meets_ball(balls: Float64, k: int, ray: Ray, limit: float) -> bool:
     """Whether a ray meets ball k of (centre, radius) before ``limit``."""
+    ox, oy, oz, dx, dy, dz = ray
     cx, cy, cz, radius = balls[k, 0] - ox, balls[k, 1] - oy, balls[k, 2] - oz, balls[k, 3]
     along = cx * dx + cy * dy + cz * dz
-    room = radius * radius - (cx * cx + cy * cy + cz * cz - along * along)
-    if room < 0.0:
+    rest = radius * radius - (cx * cx + cy * cy + cz * cz - along * along)
+    if rest < 0.0:
         return False
-    reach = math.sqrt(room)
+    reach = math.sqrt(rest)
     return bool(along + reach > 0.0 and along - reach < limit)
 
 
 @part
-def cross_rock(
-    rocks: Rocks, k: int, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, limit: float
-) -> tuple[float, int, float, float]:
+def cross_rock(rocks: Rocks, k: int, ray: Ray, limit: float) -> tuple[float, int, float, float]:
     """First meeting with rock k before ``limit``: (s, triangle, weights); s is FAR for a miss."""
     best, triangle, best_u, best_v = limit, NOTHING, 0.0, 0.0
-    ix = 1.0 / dx if dx != 0.0 else FAR
-    iy = 1.0 / dy if dy != 0.0 else FAR
-    iz = 1.0 / dz if dz != 0.0 else FAR
+    ix = 1.0 / ray.dx if ray.dx != 0.0 else FAR
+    iy = 1.0 / ray.dy if ray.dy != 0.0 else FAR
+    iz = 1.0 / ray.dz if ray.dz != 0.0 else FAR
+    inverse = Ray(ray.x, ray.y, ray.z, ix, iy, iz)
     for a in range(20):
-        if not meets_box(rocks.boxes_a, k, a, ox, oy, oz, ix, iy, iz, best):
+        if not meets_box(rocks.boxes_a, k, a, inverse, best):
             continue
         for b in range(4 * a, 4 * a + 4):
-            if not meets_box(rocks.boxes_b, k, b, ox, oy, oz, ix, iy, iz, best):
+            if not meets_box(rocks.boxes_b, k, b, inverse, best):
                 continue
             for c in range(4 * b, 4 * b + 4):
-                if not meets_box(rocks.boxes_c, k, c, ox, oy, oz, ix, iy, iz, best):
+                if not meets_box(rocks.boxes_c, k, c, inverse, best):
                     continue
                 for t in range(4 * c, 4 * c + 4):
-                    s, u, v = meets_triangle(rocks.corners_m, k, t, ox, oy, oz, dx, dy, dz)
+                    s, u, v = meets_triangle(rocks.corners_m, k, t, ray)
                     if s < best:
                         best, triangle, best_u, best_v = s, t, u, v
     if triangle == NOTHING:
@@ -640,21 +565,10 @@ def cross_rock(
 
 
 @inlined
-def in_beam(
-    balls: Float64,
-    k: int,
-    cx: float,
-    cy: float,
-    cz: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    spread: float,
-    rho: float,
-) -> bool:
-    """Whether a ray of a beam from (cx, cy, cz), see `clear_distance`, may meet ball k."""
-    x, y, z = balls[k, 0] - cx, balls[k, 1] - cy, balls[k, 2] - cz
-    along = x * dx + y * dy + z * dz
+def in_beam(balls: Float64, k: int, ray: Ray, spread: float, rho: float) -> bool:
+    """Whether a ray of a beam about ``ray``, see `clear_distance`, may meet ball k."""
+    x, y, z = balls[k, 0] - ray.x, balls[k, 1] - ray.y, balls[k, 2] - ray.z
+    along = x * ray.dx + y * ray.dy + z * ray.dz
     distance2 = x * x + y * y + z * z
     radius = balls[k, 3] + rho
     reach = radius + (math.sqrt(distance2) + radius) * spread
@@ -663,23 +577,14 @@ def in_beam(
 
 @part
 def nearest_rock(
-    rocks: Rocks,
-    near: Int64,
-    count: int,
-    ox: float,
-    oy: float,
-    oz: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    limit: float,
+    rocks: Rocks, near: Int64, count: int, ray: Ray, limit: float
 ) -> tuple[float, int, int, float, float]:
     """First meeting with one of ``count`` rocks before ``limit``: (s, rock, triangle, weights)."""
     s, rock, triangle, u, v = limit, NOTHING, NOTHING, 0.0, 0.0
     for j in range(count):
         k = near[j]
-        if meets_ball(rocks.spheres_m, k, ox, oy, oz, dx, dy, dz, s):
-            met_s, met_t, met_u, met_v = cross_rock(rocks, k, ox, oy, oz, dx, dy, dz, s)
+        if meets_ball(rocks.spheres_m, k, ray, s):
+            met_s, met_t, met_u, met_v = cross_rock(rocks, k, ray, s)
             if met_s < s:
                 s, rock, triangle, u, v = met_s, k, met_t, met_u, met_v
     return s, rock, triangle, u, v
@@ -688,33 +593,33 @@ def nearest_rock(
 @entry
 def cast_rays(world: World, origins_m: Float64, directions: Float64, ranges_m: Float64) -> None:
     """Fill ranges_m (n,) with the distance to the first thing met, not-a-number for none."""
-    inner, outer, rocks = borrowed_grid(world.inner), borrowed_grid(world.outer), borrowed_rocks(world.rocks)
+    world = borrowed(world)
+    rocks = world.rocks
     for k in range(origins_m.shape[0]):
-        ox, oy, oz = origins_m[k, 0], origins_m[k, 1], origins_m[k, 2]
-        dx, dy, dz = directions[k, 0], directions[k, 1], directions[k, 2]
-        s, _ix, _iy = cross_grid(inner, ox, oy, -oz, dx, dy, -dz, 0.0, FAR)
+        ray = Ray(
+            origins_m[k, 0], origins_m[k, 1], origins_m[k, 2],
+            directions[k, 0], directions[k, 1], directions[k, 2],
+        )  # fmt: skip
+        s, _ix, _iy = cross_grid(world.inner, ray, 0.0, FAR)
         if s >= FAR:
-            s, _ix, _iy = cross_outer(inner, outer, ox, oy, -oz, dx, dy, -dz, 0.0)
+            s, _ix, _iy = cross_outer(world.inner, world.outer, ray, 0.0)
         for rock in range(rocks.spheres_m.shape[0]):
-            if meets_ball(rocks.spheres_m, rock, ox, oy, oz, dx, dy, dz, s):
-                met = cross_rock(rocks, rock, ox, oy, oz, dx, dy, dz, s)
-                s = min(s, met[0])
+            if meets_ball(rocks.spheres_m, rock, ray, s):
+                s = min(s, cross_rock(rocks, rock, ray, s)[0])
         ranges_m[k] = s if 0.0 < s < FAR else np.nan
 
 
 @entry
 def shadow_rays(rocks: Rocks, sun: Float64, points_m: Float64, clear: Float32) -> None:
     """Fill clear (n,) with 0 where a rock stands between a point and the sun, 1 elsewhere."""
-    rocks, sun = borrowed_rocks(rocks), borrowed(sun)
+    rocks, sun = borrowed(rocks), borrowed(sun)
     for k in range(points_m.shape[0]):
-        x, y, z = points_m[k, 0], points_m[k, 1], points_m[k, 2]
+        ray = Ray(points_m[k, 0], points_m[k, 1], points_m[k, 2], sun[0], sun[1], sun[2])
         clear[k] = 1.0
         for rock in range(rocks.spheres_m.shape[0]):
-            if meets_ball(rocks.spheres_m, rock, x, y, z, sun[0], sun[1], sun[2], FAR):
-                met = cross_rock(rocks, rock, x, y, z, sun[0], sun[1], sun[2], FAR)
-                if met[0] < FAR:
-                    clear[k] = 0.0
-                    break
+            if meets_ball(rocks.spheres_m, rock, ray, FAR) and cross_rock(rocks, rock, ray, FAR)[0] < FAR:
+                clear[k] = 0.0
+                break
 
 
 # The light that comes back from ground, rocks and sky, by textures over the footprint of a ray.
@@ -881,16 +786,12 @@ def rock_light(
     t: int,
     u: float,
     v: float,
-    x: float,
-    y: float,
-    z: float,
+    ray: Ray,
     s: float,
-    dx: float,
-    dy: float,
-    dz: float,
     pitch: float,
 ) -> float:
     """Brightness of a point of a rock: stone texture laid on from three sides, sun on the bent normal."""
+    x, y, z = ray.x + s * ray.dx, ray.y + s * ray.dy, ray.z + s * ray.dz
     w = 1.0 - u - v
     normals = rocks.normals
     nx = w * normals[k, t, 0, 0] + u * normals[k, t, 1, 0] + v * normals[k, t, 2, 0]
@@ -898,7 +799,7 @@ def rock_light(
     nz = w * normals[k, t, 0, 2] + u * normals[k, t, 1, 2] + v * normals[k, t, 2, 2]
     inv = 1.0 / math.sqrt(nx * nx + ny * ny + nz * nz)
     nx, ny, nz = nx * inv, ny * inv, nz * inv
-    facing = max(-(nx * dx + ny * dy + nz * dz), 0.25)
+    facing = max(-(nx * ray.dx + ny * ray.dy + nz * ray.dz), 0.25)
     width = s * pitch / math.sqrt(facing)
     lx, ly, lz = (
         x - rocks.spheres_m[k, 0],
@@ -1109,20 +1010,6 @@ def turned(r: Float64, x: float, y: float, z: float) -> tuple[float, float, floa
     )
 
 
-@part
-def borrowed_world(world: World) -> World:
-    """The world without owners."""
-    return World(
-        borrowed_grid(world.inner),
-        borrowed_grid(world.outer),
-        borrowed_rocks(world.rocks),
-        borrowed_texture(world.detail),
-        borrowed_texture(world.broad),
-        borrowed_texture(world.stone),
-        borrowed(world.sun),
-    )
-
-
 @inlined
 def take_rays(view: RayView, bundle: Float64, y0: int, y1: int, x0: int, x1: int) -> int:
     """Fill the bundle with the rays of the pixels [y0, y1) x [x0, x1), in the site frame; return how many."""
@@ -1168,22 +1055,21 @@ def pixel_light(
             if not over_ground(inner, ox, oy, -oz):
                 continue
         rays_met += 1
+        ray = Ray(ox, oy, oz, dx, dy, dz)
         ix, iy = 0, 0
         if bundle[MET_B, first + i] > 0.0:
             s = bundle[MET_A, first + i] / bundle[MET_B, first + i]
         else:
-            s, ix, iy = cross_from_inside(inner, ox, oy, -oz, dx, dy, -dz, block.clear_m)
+            s, ix, iy = cross_from_inside(inner, ray, block.clear_m)
         beyond = s >= FAR
         if beyond:
-            s, ix, iy = cross_outer(inner, outer, ox, oy, -oz, dx, dy, -dz, block.clear_beyond_m)
+            s, ix, iy = cross_outer(inner, outer, ray, block.clear_beyond_m)
         if block.n_near > 0:
-            s, rock, triangle, u, v = nearest_rock(world.rocks, near, block.n_near, ox, oy, oz, dx, dy, dz, s)
+            s, rock, triangle, u, v = nearest_rock(world.rocks, near, block.n_near, ray, s)
             if rock != NOTHING:
-                px, py, pz = ox + s * dx, oy + s * dy, oz + s * dz
                 total += rock_light(
-                    world.rocks, world.stone, world.sun, rock, triangle, u, v, px, py, pz, s, dx, dy, dz,
-                    block.pitch,
-                )  # fmt: skip
+                    world.rocks, world.stone, world.sun, rock, triangle, u, v, ray, s, block.pitch
+                )
                 continue
         if s >= FAR:
             total += sky_light(-dz)
@@ -1230,7 +1116,7 @@ def render_tiles(
     radians. rotation (3, 3) turns the mounting frame into the site frame, and centre_m (3,) is C there.
     scratch (5, block * block * q) is written over.
     """
-    world = borrowed_world(world)
+    world = borrowed(world)
     view = RayView(borrowed(rays), borrowed(starts), borrowed(rotation), borrowed(centre_m))
     height, width, q = rays.shape[0], rays.shape[1], rays.shape[2]
     inner, balls = world.inner, world.rocks.spheres_m
@@ -1248,10 +1134,11 @@ def render_tiles(
         if not spread >= 0.0:  # no ray in this tile
             continue
         bx, by, bz = turned(rotation, tx, ty, tz)
-        tile_clear = clear_distance(inner, mx, my, -mz, bx, by, -bz, spread, rho, 0.0, 1.0)
+        beam = Ray(mx, my, mz, bx, by, bz)
+        tile_clear = clear_distance(inner, beam, spread, rho, 0.0, 1.0)
         n_tile = 0
         for k in range(balls.shape[0]):
-            if in_beam(balls, k, mx, my, mz, bx, by, bz, spread, rho):
+            if in_beam(balls, k, beam, spread, rho):
                 in_tile[n_tile] = k
                 n_tile += 1
         for part_of_tile in range(per_tile * per_tile):
@@ -1262,15 +1149,16 @@ def render_tiles(
             if not spread >= 0.0:
                 continue
             bx, by, bz = turned(rotation, tx, ty, tz)
+            beam = Ray(mx, my, mz, bx, by, bz)
             step = 8.0 * (rho + tile_clear * spread)
-            clear = clear_distance(inner, mx, my, -mz, bx, by, -bz, spread, rho, tile_clear, step)
+            clear = clear_distance(inner, beam, spread, rho, tile_clear, step)
             beyond = 0.0
             if clear >= near_edge:
-                beyond = clear_distance(world.outer, mx, my, -mz, bx, by, -bz, spread, rho, near_edge, 8.0)
+                beyond = clear_distance(world.outer, beam, spread, rho, near_edge, 8.0)
             n_block = 0
             for listed in range(n_tile):
                 k = in_tile[listed]
-                if in_beam(balls, k, mx, my, mz, bx, by, bz, spread, rho):
+                if in_beam(balls, k, beam, spread, rho):
                     in_block[n_block] = k
                     n_block += 1
             y1, x1 = min(j * block + block, height), min(i * block + block, width)

@@ -12,9 +12,10 @@ from __future__ import annotations
 import os
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -29,6 +30,8 @@ from drivers.sim.scene import Scene, tiny_scene
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Draw = Callable[..., Float32]
+"""Takes what `Renderer.image` takes and returns a picture."""
 
 TILE_PX = 16  # squares for which rocks and the distance to the ground are bounded first...
 BLOCK_PX = 4  # ...and then more closely
@@ -239,22 +242,6 @@ class Renderer:
             return self._tables[key]
 
 
-class DrawsPictures(Protocol):
-    """What pictures are drawn with: a scene's `Renderer`, or one with more in it."""
-
-    def image(
-        self,
-        camera: CameraModel,
-        site_from_camera_frame: Rigid,
-        samples: int = 2,
-        rows: tuple[int, int] | None = None,
-    ) -> Float32:
-        """Return a picture."""
-
-    def close(self) -> None:
-        """Let go of what it has."""
-
-
 class Stills:
     """Pictures of poses seen lately, so that a camera at rest before a scene that stands is drawn once.
 
@@ -263,8 +250,8 @@ class Stills:
     camera sees (light, dust, exposure, temperature) comes after this, or joins the key. Safe from any thread.
     """
 
-    def __init__(self, renderer: DrawsPictures) -> None:
-        self._renderer = renderer
+    def __init__(self, draw: Draw) -> None:
+        self._draw = draw
         self._lock = threading.Lock()
         self._images: OrderedDict[tuple[object, ...], Float32] = OrderedDict()
 
@@ -280,7 +267,7 @@ class Stills:
         """Return what `Renderer.image` returns, read-only, and keep it. Raises what that raises."""
         image = self.find(camera, site_from_camera_frame, samples)
         if image is None:
-            image = self._renderer.image(camera, site_from_camera_frame, samples)
+            image = self._draw(camera, site_from_camera_frame, samples)
             image.setflags(write=False)
             with self._lock:
                 self._images[self._key(camera, site_from_camera_frame, samples)] = image

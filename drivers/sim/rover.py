@@ -109,10 +109,11 @@ class RoverModel:
         check_clear_of(settings.scene.placed, self.rig)
         self.scene: Scene = kept_scene(settings.scene)
         placed = [placed_board(board, self.scene.ground_z_m) for board in settings.scene.boards]
-        self._renderer = BenchBoards(Renderer(self.scene), placed)
+        self._renderer = Renderer(self.scene)
+        self._boards = BenchBoards(self._renderer.image, placed)
         # Before any camera is queried: a frame's deadline is no time for a compiler.
         compile_renderer()
-        self._stills = Stills(self._renderer)
+        self._stills = Stills(self._boards.image)
         self._render_lock = threading.Lock()
         self._closing = threading.Event()
         self._closed = False
@@ -187,7 +188,7 @@ class RoverModel:
     @property
     def boards(self) -> Mapping[str, BenchBoard]:
         """The boards that are held up before the rover, by name."""
-        return self._renderer.boards
+        return self._boards.boards
 
     def put_board(
         self,
@@ -229,7 +230,7 @@ class RoverModel:
         printed = board if board is not None else before.board if before else None
         assert printed is not None
         stands = checked(name, BenchBoard(printed, self.site_from_rover @ rover_from_board, bow), self.boards)
-        self._renderer.put(name, stands)
+        self._boards.put(name, stands)
         self._look_again()
         return stands
 
@@ -237,17 +238,17 @@ class RoverModel:
         """Take a board away. Raises BadOptions if there is none of this name."""
         if name not in self.boards:
             raise BadOptions(f"there is no board {name!r}{nearest(name, self.boards)}")
-        self._renderer.put(name, None)
+        self._boards.put(name, None)
         self._look_again()
 
     def _look_again(self) -> None:
         """Forget pictures of what stood there before."""
-        self._stills = Stills(self._renderer)
+        self._stills = Stills(self._boards.image)
         self._metered_at.clear()
 
     def _cast(self, origins_m: ArrayLike, directions: ArrayLike) -> FloatArray:
         """How far rays of the site frame go, boards included."""
-        return self._renderer.cast(origins_m, directions, self.scene.cast(origins_m, directions))
+        return self._boards.cast(origins_m, directions, self.scene.cast(origins_m, directions))
 
     def frame_truth(self, camera: str, sequence: int) -> FrameTruth:
         """Return where a camera was when a frame was taken.
@@ -356,7 +357,7 @@ class RoverModel:
         for step in range(count):
             pose = self._pose(name, begin_s + (step + 0.5) / count * exposure_s)
             with self._drawing(name):
-                views.append(self._renderer.image(few, pose, 1))
+                views.append(self._boards.image(few, pose, 1))
         light = np.asarray(np.mean(views, axis=0), dtype=np.float32)
         return np.asarray(cv2.resize(light, model.size_px, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
 
@@ -365,7 +366,7 @@ class RoverModel:
 
         def draw(model: CameraModel, pose: Rigid, samples: int, rows: tuple[int, int]) -> NDArray[np.float32]:
             with self._drawing(name):
-                return self._renderer.image(model, pose, samples, rows)
+                return self._boards.image(model, pose, samples, rows)
 
         model, row_time_s = self._model(name, time_s), self.settings.camera.row_time_s
         return Shutter(model, row_time_s, partial(self._pose, name), draw, self._cast)
@@ -389,7 +390,7 @@ class RoverModel:
         if kept is None or kept[0] != pose:
             camera = coarse(self.rig.cameras[name].model, METER_PX)
             with self._drawing(name):
-                light = self._renderer.image(camera, pose, 1)
+                light = self._boards.image(camera, pose, 1)
             if not self._lenses[name].changes_nothing:
                 light *= self._lenses[name].transmission.mean()
             self._metered_at[name] = kept = (pose, light)

@@ -10,7 +10,7 @@ import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
@@ -51,17 +51,6 @@ class ExposureSettings(DriverOptions):
     """The longest time; gain rises where it is too short."""
     most_gain: Annotated[float, Field(ge=1.0, le=64.0)] = 8.0
     """The highest gain."""
-    day_s: Annotated[float, Field(ge=0.0, le=1e7)] = 0.0
-    """Length of a day that the run begins at noon of; 0: it stays noon."""
-    night_share: Annotated[float, Field(ge=0.0, le=1.0)] = 0.1
-    """The brightness of midnight over that of noon."""
-
-    def daylight(self, passed_s: float) -> float:
-        """Return the brightness of a moment over that of noon."""
-        if not self.day_s:
-            return 1.0
-        wave = 0.5 + 0.5 * math.cos(math.tau * passed_s / self.day_s)
-        return self.night_share + (1.0 - self.night_share) * wave
 
 
 @dataclass(frozen=True)
@@ -74,14 +63,12 @@ class FrameExposure:
 
 
 class FixedExposure:
-    """The same for every frame but for daylight, until it is changed; safe from any thread.
+    """The same for every frame, until it is changed; safe from any thread.
 
     Without a ``reference_s`` the scene has its own brightness at what it begins with.
     """
 
-    def __init__(self, settings: ExposureSettings, exposure_s: float, start_s: float) -> None:
-        self._settings = settings
-        self._start_s = start_s
+    def __init__(self, settings: ExposureSettings, exposure_s: float) -> None:
         self._amount_s = settings.reference_s or exposure_s
         gain = settings.gain if settings.reference_s > 0 else 1.0
         # (since_s, exposure_s, gain), replaced as a whole
@@ -102,10 +89,9 @@ class FixedExposure:
 
     def shot(self, _sequence: int, begin_s: float, _period_s: float) -> FrameExposure:
         """Return time and gain of the frame whose exposure begins at a moment."""
-        daylight = self._settings.daylight(begin_s - self._start_s)
         changes = self._set
         _, exposure_s, gain = next((one for one in reversed(changes) if one[0] < begin_s), changes[0])
-        return FrameExposure(exposure_s, gain, exposure_s * gain / self._amount_s * daylight)
+        return FrameExposure(exposure_s, gain, exposure_s * gain / self._amount_s)
 
     def _recent(self, now_s: float) -> tuple[tuple[float, float, float], ...]:
         """What a frame may have been taken with that is requested at a moment."""
@@ -114,37 +100,25 @@ class FixedExposure:
         return changes[first:]
 
 
-@dataclass
-class _Decided:
-    """What the loop decided, by frame: time times gain, seconds."""
-
-    amounts_s: dict[int, float] = field(default_factory=dict)
-    next_frame: int = 0
-
-
 class AutoExposure:
     """A loop over a camera's frames; safe from any thread.
 
-    Parameters
-    ----------
-    metered
-        ``metered(time_s)``: a coarse picture of the moment at the scene's own brightness.
+    ``metered(time_s)`` is a coarse picture of the moment at the scene's own brightness.
     """
 
     def __init__(
         self,
         settings: ExposureSettings,
         exposure_s: float,
-        start_s: float,
         metered: Callable[[float], Float32],
         now_s: Callable[[], float],
     ) -> None:
         self._settings = settings
         self._exposure_s = exposure_s
-        self._start_s = start_s
         self._metered = metered
         self._now_s = now_s
-        self._decided = _Decided()
+        self._amounts_s: dict[int, float] = {}  # time times gain, by frame
+        self._next_frame = 0
         self._holds: list[tuple[float, float]] = []
         self._held = 0
         self._held_since_s = 0.0
@@ -172,37 +146,33 @@ class AutoExposure:
     def shot(self, sequence: int, begin_s: float, period_s: float) -> FrameExposure:
         """Return time and gain of a frame; those before it are metered first, where they were not yet."""
         with self._lock:
-            done = self._decided
-            if sequence - done.next_frame > FRAMES_KEPT:
-                last_s = done.amounts_s.get(done.next_frame - 1, self._exposure_s)
-                done.next_frame = sequence - FRAMES_KEPT
-                done.amounts_s = dict.fromkeys(
-                    range(done.next_frame - self._settings.lag_frames, done.next_frame), last_s
-                )
-            while done.next_frame <= sequence:
-                frame = done.next_frame
-                done.amounts_s[frame] = self._amount_s(
-                    frame, begin_s - (sequence - frame) * period_s, period_s
-                )
-                done.amounts_s.pop(frame - 2 * FRAMES_KEPT, None)
-                done.next_frame += 1
-            amount_s = done.amounts_s.get(sequence, self._exposure_s)
+            if sequence - self._next_frame > FRAMES_KEPT:
+                last_s = self._amounts_s.get(self._next_frame - 1, self._exposure_s)
+                self._next_frame = sequence - FRAMES_KEPT
+                first = self._next_frame - self._settings.lag_frames
+                self._amounts_s = dict.fromkeys(range(first, self._next_frame), last_s)
+            while self._next_frame <= sequence:
+                frame = self._next_frame
+                frame_begin_s = begin_s - (sequence - frame) * period_s
+                self._amounts_s[frame] = self._amount_s(frame, frame_begin_s, period_s)
+                self._amounts_s.pop(frame - 2 * FRAMES_KEPT, None)
+                self._next_frame += 1
+            amount_s = self._amounts_s.get(sequence, self._exposure_s)
         s = self._settings
         exposure_s = min(max(amount_s, s.shortest_s), s.longest_s)
         gain = min(max(1.0, amount_s / exposure_s), s.most_gain)
-        daylight = s.daylight(begin_s - self._start_s)
-        return FrameExposure(exposure_s, gain, exposure_s * gain / s.reference_s * daylight)
+        return FrameExposure(exposure_s, gain, exposure_s * gain / s.reference_s)
 
     def _amount_s(self, frame: int, begin_s: float, period_s: float) -> float:
         """Time times gain of a frame."""
-        amounts_s, s = self._decided.amounts_s, self._settings
+        amounts_s, s = self._amounts_s, self._settings
         before_s = amounts_s.get(frame - 1, self._exposure_s)
         seen = frame - s.lag_frames
         if seen < 0 or self._is_held(begin_s):
             return before_s
         seen_s = begin_s - s.lag_frames * period_s
         seen_with_s = amounts_s.get(seen, before_s)
-        brightness = seen_with_s / s.reference_s * s.daylight(seen_s - self._start_s)
+        brightness = seen_with_s / s.reference_s
         mean_dn = float(np.clip(self._metered(seen_s) * brightness, 0.5, 255.0).mean())
         step: float = min(max((s.target_dn / mean_dn) ** s.share, 1 / MOST_STEP), MOST_STEP)
         return min(max(seen_with_s * step, s.shortest_s), s.longest_s * s.most_gain)

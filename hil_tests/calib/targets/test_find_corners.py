@@ -42,23 +42,18 @@ APRILGRID = AprilGrid(6, 5, 0.04, 0.012)
 BOARDS: list[AnyBoard] = [CHARUCO, APRILGRID, Checkerboard(9, 8, 0.03), DotBoard(10, 8, 0.03, 0.015)]
 
 
-class Grey:
+def grey(
+    camera: CameraModel, pose: Rigid, samples: int = 2, rows: tuple[int, int] | None = None
+) -> NDArray[np.float32]:
     """A scene of nothing."""
-
-    def image(
-        self, camera: CameraModel, pose: Rigid, samples: int = 2, rows: tuple[int, int] | None = None
-    ) -> NDArray[np.float32]:
-        return np.full(camera.size_px[::-1], 100.0, dtype=np.float32)
-
-    def close(self) -> None:
-        pass
+    return np.full(camera.size_px[::-1], 100.0, dtype=np.float32)
 
 
 @lru_cache
 def _drawn(
     boards: tuple[tuple[AnyBoard, tuple[float, ...], tuple[float, ...]], ...], blur_px: float
 ) -> Image:
-    scene = BenchBoards(Grey())
+    scene = BenchBoards(grey)
     for k, (board, turn, place) in enumerate(boards):
         rotation, _ = cv2.Rodrigues(np.asarray(turn, dtype=np.float64))
         scene.put(str(k), BenchBoard(board, Rigid(rotation, np.asarray(place, dtype=np.float64))))

@@ -25,20 +25,13 @@ CORNER_PX = 0.04
 """Of 170 between ink and paper: by so much may two ways to sample a pixel differ, root mean square."""
 
 
-class Grey:
+def grey(camera: CameraModel, pose: Rigid, samples: int = 2, rows: tuple[int, int] | None = None) -> Float32:
     """A scene of nothing."""
-
-    def image(
-        self, camera: CameraModel, pose: Rigid, samples: int = 2, rows: tuple[int, int] | None = None
-    ) -> Float32:
-        return np.full(camera.size_px[::-1], 100.0, dtype=np.float32)
-
-    def close(self) -> None:
-        pass
+    return np.full(camera.size_px[::-1], 100.0, dtype=np.float32)
 
 
 def picture(board: BenchBoard) -> Float32:
-    boards = BenchBoards(Grey())
+    boards = BenchBoards(grey)
     boards.put("one", board)
     return boards.image(CAMERA, Rigid.identity())
 
@@ -49,11 +42,11 @@ def test_corners_are_where_opencv_projects_and_finds_them(bow_m: tuple[float, fl
     turn = np.array(cv2.Rodrigues(np.array([0.3, -0.4, 0.1]))[0], float)
     shift = np.array([0.03, -0.02, 0.8])
     seen = picture(BenchBoard(board, Rigid(turn, shift), bow_m))
-    grey = np.rint(cv2.GaussianBlur(seen, (0, 0), 0.6)).astype(np.uint8)
-    found, corners = cv2.findChessboardCorners(grey, (7, 6))
+    levels = np.rint(cv2.GaussianBlur(seen, (0, 0), 0.6)).astype(np.uint8)
+    found, corners = cv2.findChessboardCorners(levels, (7, 6))
     assert found
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
-    corners = cv2.cornerSubPix(grey, corners, (6, 6), (-1, -1), stop)
+    corners = cv2.cornerSubPix(levels, corners, (6, 6), (-1, -1), stop)
     x, y = np.meshgrid((np.arange(7) - 3) * 0.04, (np.arange(6) - 2.5) * 0.04)
     z = -bow_m[0] * (1 - (x / 0.12) ** 2) - bow_m[1] * (1 - (y / 0.1) ** 2)
     points = np.stack([x, y, z], axis=-1).reshape(-1, 3)
@@ -65,7 +58,7 @@ def test_corners_are_where_opencv_projects_and_finds_them(bow_m: tuple[float, fl
 
 
 def test_the_nearer_of_two_boards_hides_the_other() -> None:
-    boards = BenchBoards(Grey())
+    boards = BenchBoards(grey)
     near = BenchBoard(Checkerboard(4, 4, 0.05), Rigid(np.eye(3), np.array([0.0, 0.0, 1.0])))
     far = BenchBoard(AprilGrid(6, 6, 0.08, 0.024), Rigid(np.eye(3), np.array([0.0, 0.0, 2.0])))
     boards.put("near", near)

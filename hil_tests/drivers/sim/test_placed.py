@@ -65,9 +65,9 @@ def picture(placed: Scene) -> np.ndarray:
         V=np.array([(height - 1) / 2, 0.0, FOCAL_PX]),
     )  # fmt: skip
     boards = [placed_board(board, placed.ground_z_m) for board in placed.settings.boards]
-    renderer = BenchBoards(Renderer(placed), boards)
+    renderer = Renderer(placed)
     try:
-        return renderer.image(camera, Rigid.identity(), 8)
+        return BenchBoards(renderer.image, boards).image(camera, Rigid.identity(), 8)
     finally:
         renderer.close()
 

@@ -119,7 +119,7 @@ def test_a_picture_is_drawn_again_as_soon_as_one_bit_differs(
     rough: Renderer,
 ) -> None:
     camera, pose = small(bias.NAVCAM, 8), bias.head_pose(4.0, 0.1, -0.1)
-    stills = Stills(rough)
+    stills = Stills(rough.image)
     first = stills.image(camera, pose, 1)
     assert stills.image(camera, Rigid(pose.rotation.copy(), pose.translation_m.copy()), 1) is first
     assert not first.flags.writeable
