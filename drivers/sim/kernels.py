@@ -141,11 +141,11 @@ def _borrowed(_context: Any, value: Any) -> Any:
     """
 
     def without_owner(context: Any, builder: Any, kind: Any, part: Any) -> Any:
-        if isinstance(kind, types.BaseTuple):
+        if isinstance(kind, numba_types.BaseTuple):
             for index, inside in enumerate(kind.types):
                 freed = without_owner(context, builder, inside, builder.extract_value(part, index))
                 part = builder.insert_value(part, freed, index)
-        elif isinstance(kind, types.Array):
+        elif isinstance(kind, numba_types.Array):
             proxy = numba_structs.create_struct_proxy(kind)(context, builder, value=part)
             proxy.meminfo = numba_structs.get_null_value(proxy.meminfo.type)
             part = proxy._getvalue()
@@ -158,6 +158,7 @@ def _borrowed(_context: Any, value: Any) -> Any:
 
 
 numba_structs: Any = cgutils
+numba_types: Any = types
 borrowed = cast(Callable[[Any], Any], intrinsic(_borrowed))
 
 
