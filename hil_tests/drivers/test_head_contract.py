@@ -17,6 +17,7 @@ import pytest
 
 from drivers.errors import DriverError, LineLost, NoReply
 from drivers.interfaces import Reading
+from drivers.simulation_clock import MAX
 from hil_tests.left_behind import held
 from hil_tests.support.servo_rigs import LIMITS_RAD, RIGS, TURNED, HeadRig
 from hil_tests.waiting import until
@@ -24,7 +25,7 @@ from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.pointing import run_pointing_experiment
-from mastctl.experiment.simulated import SimulationTruth, demo_config
+from mastctl.experiment.simulated import simulated_config, simulation_truth
 from mastctl.testing.drivers import test_head as suite
 from mastctl.testing.drivers.head_trial import HeadTrial
 
@@ -319,7 +320,7 @@ ANOTHER_HEAD = pytest.mark.long(1, "the loop with another head; one of each make
 @pytest.mark.usefixtures("one_scene")
 def test_the_demos_pointing_loop_lands_with_every_head(wire: str | None, head: str, worst_px: float) -> None:
     # A count of the X is 2 px and its backlash 5.6 px of the navcam; the PTU's steps are 0.07 px.
-    config = demo_config(load_config(None), head=head, wire=wire, seed=1)
+    config = simulated_config(load_config(None), head=head, wire=wire, seed=1, speed=MAX)
     simulation = {**config.hardware.simulation, "samples": 1}
     cameras = {n: c for n, c in config.hardware.cameras.items() if n.startswith("navcam")}
     hardware = replace(config.hardware, simulation=simulation, cameras=cameras)
@@ -327,7 +328,7 @@ def test_the_demos_pointing_loop_lands_with_every_head(wire: str | None, head: s
         simulated = daemon.hardware.simulation
         assert simulated is not None
         found = run_pointing_experiment(
-            client, targets=1, distances_m=(6.0,), seed=1, truth=SimulationTruth(simulated)
+            client, targets=1, distances_m=(6.0,), seed=1, truth=simulation_truth(simulated)
         )
     assert [record.error for record in found.records] == [""]
     worst = found.summaries[0].true_second_rms_px

@@ -152,19 +152,22 @@ def _run_simulated(args: argparse.Namespace) -> Answer:
 )
 def run_demo(args: argparse.Namespace) -> Answer:
     """Start a simulated rover behind a daemon on a free port, and run the experiment on it."""
+    from drivers.simulation_clock import MAX
     from mastctl.client import Client
     from mastctl.config import load_config
     from mastctl.daemon import RunningDaemon
     from mastctl.experiment.pointing import head_pair
-    from mastctl.experiment.simulated import SimulationTruth, demo_config, head_note, own_config
+    from mastctl.experiment.simulated import head_note, simulated_config, simulation_truth
 
     check_folder(args.out, "--out")
-    if args.config is None:
-        config = demo_config(
-            load_config(None), head=args.head, wire=args.wire, seed=args.seed, speed=args.speed
-        )
-    else:
-        config = own_config(load_config(args.config), head=args.head, wire=args.wire, speed=args.speed)
+    packaged = args.config is None
+    config = simulated_config(
+        load_config(args.config),
+        head=args.head,
+        wire=args.wire,
+        speed=MAX if packaged and args.speed is None else args.speed,
+        seed=args.seed if packaged else None,
+    )
     compiles = "building the simulated rover and its ground (the first time also compiling the renderer)"
     with output.waiting(args.json, compiles):
         running = RunningDaemon(config)
@@ -176,8 +179,7 @@ def run_demo(args: argparse.Namespace) -> Answer:
         notes = (head_note(rover, rig, camera),)
         behind = f" behind {args.wire} bytes" if args.wire else ""
         output.tell(f"simulated rover at {daemon.url}, head {rover.settings.head.name}{behind}")
-        truth = SimulationTruth(rover)
-        experiment = _run(args, client, DEFAULT_DISTANCES_M, truth, notes)
+        experiment = _run(args, client, DEFAULT_DISTANCES_M, simulation_truth(rover), notes)
     return _report(args, experiment)
 
 

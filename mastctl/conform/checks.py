@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -28,18 +28,10 @@ class SubjectLost(Exception):
 
 @dataclass(frozen=True)
 class Check:
-    """One promise and the function that tests it.
+    """One promise, a sentence, and the function that tests it.
 
-    Attributes
-    ----------
-    name
-        ``group.name``, as reports and ``--only`` have it.
-    promise
-        One sentence: what has to hold.
-    moves
-        Whether the head moves for it, or would if the promise were broken.
-    test
-        Returns what was measured, in a few words. Raises PromiseBroken, NotTried.
+    ``name`` is ``group.name``; ``moves``: whether the head moves for it, or would if the promise were broken.
+    ``test`` returns a short text of what was measured, and raises PromiseBroken or NotTried.
     """
 
     name: str
@@ -65,73 +57,32 @@ def expect(holds: object, message: str) -> None:
         raise PromiseBroken(message)
 
 
-def run_checks(
-    checks: Iterable[Check],
-    rig: Any,
-    *,
-    motion: bool,
-    report: Callable[[CheckOutcome], object] = lambda outcome: None,
-) -> list[CheckOutcome]:
-    """Run checks one after the other; return their outcomes.
-
-    Parameters
-    ----------
-    checks, rig
-        The checks, and the rig that they test.
-    motion
-        Whether the head may move; without it, checks that move it are skipped.
-    report
-        Called with each outcome as it comes.
-    """
-    outcomes: list[CheckOutcome] = []
-    lost = ""
-    for check in checks:
-        began_s = time.monotonic()
-        state: State = "skipped"
-        if lost:
-            message = f"not tried after {lost}"
-        elif check.moves and not motion:
-            message = "the head may not move"
-        else:
-            try:
-                state, message = _outcome(check, rig)
-            except SubjectLost as reason:
-                state, message, lost = "failed", str(reason), check.name
-        outcomes.append(CheckOutcome(check.name, check.promise, state, message, time.monotonic() - began_s))
-        report(outcomes[-1])
-    return outcomes
-
-
-def _outcome(check: Check, rig: Any) -> tuple[State, str]:
-    """Run one check; return its state and a sentence. Raises SubjectLost."""
+def outcome_of(check: Check, rig: Any) -> CheckOutcome:
+    """Run one check. Raises SubjectLost."""
+    began_s = time.monotonic()
+    state: State = "failed"
     try:
-        return "passed", check.test(rig) or ""
-    except PromiseBroken as broken:
-        return "failed", str(broken)
+        state, message = "passed", check.test(rig) or ""
     except NotTried as reason:
-        return "skipped", str(reason)
+        state, message = "skipped", str(reason)
     except SubjectLost:
         raise
     except ClientError as error:
         if error.code == "no_daemon":
             raise SubjectLost(str(error)) from None
-        return "failed", str(error)
-    except DriverError as error:
-        return "failed", str(error)
+        message = str(error)
+    except (PromiseBroken, DriverError) as error:
+        message = str(error)
     except Exception as error:  # a daemon of another version may answer anything
-        return "failed", f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+        message = f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"
+    return CheckOutcome(check.name, check.promise, state, message, time.monotonic() - began_s)
 
 
 @dataclass(frozen=True)
 class ConformReport:
-    """The outcomes of the checks of one rig.
+    """The outcomes of the checks of one rig; ``subject`` is the daemon's address.
 
-    Attributes
-    ----------
-    subject
-        The daemon's address.
-    may_move
-        Why the head may still move after all, one sentence; empty when it was stopped, or never moved.
+    ``may_move`` is why the head may still move, one sentence; empty when it was stopped, or never moved.
     """
 
     subject: str

@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -19,8 +20,9 @@ from mastctl.conform.checks import (
     ConformReport,
     NotTried,
     PromiseBroken,
+    SubjectLost,
     expect,
-    run_checks,
+    outcome_of,
 )
 from mastctl.errors import NotNow
 
@@ -37,15 +39,7 @@ STOP_TRIES, STOP_TIMEOUT_S = 3, 5.0
 
 
 class RigTrial:
-    """A rig under test.
-
-    Parameters
-    ----------
-    client
-        A connection to its daemon.
-    reach_rad
-        How far from its present pose the head may be moved, radians.
-    """
+    """A rig under test; its head may be moved by ``reach_rad`` from its present pose."""
 
     def __init__(self, client: Client, reach_rad: float) -> None:
         self.client = client
@@ -167,15 +161,7 @@ class RigTrial:
 
 @contextmanager
 def rig_under_test(url: str, reach_rad: float) -> Iterator[RigTrial]:
-    """Connect to a daemon that is at rest.
-
-    Raises
-    ------
-    NotNow
-        ``busy``, if it is at work: a check would disturb that.
-    ClientError
-        If no mastctl daemon answers at the address.
-    """
+    """Connect to a daemon that is at rest. Raises NotNow (``busy``) if it is at work, and ClientError."""
     with Client(url, TIMEOUT_S, "mastctl conform") as client:
         trial = RigTrial(client, reach_rad)
         at_work = _at_work(trial.began)
@@ -192,18 +178,22 @@ def check_rig(
 ) -> ConformReport:
     """Run checks on a rig. However they end, by Ctrl-C too, a head that was moved is stopped.
 
-    Parameters
-    ----------
-    trial, checks
-        The rig, and its checks.
-    motion
-        Whether the head may be moved.
-    report
-        Called with each outcome as it comes.
+    Without ``motion`` checks that move the head are skipped; ``report`` is called with each outcome.
     """
-    left = ""
+    outcomes: list[CheckOutcome] = []
+    lost = left = ""
     try:
-        outcomes = run_checks(checks, trial, motion=motion, report=report)
+        for check in checks:
+            reason = f"not tried after {lost}" if lost else "the head may not move"
+            outcome = CheckOutcome(check.name, check.promise, "skipped", reason, 0.0)
+            if not lost and (motion or not check.moves):
+                try:
+                    outcome = outcome_of(check, trial)
+                except SubjectLost as error:
+                    lost = check.name
+                    outcome = replace(outcome, state="failed", message=str(error))
+            outcomes.append(outcome)
+            report(outcome)
     finally:
         if motion and any(check.moves for check in checks):
             left = _stopped_at_the_end(trial.client.url)

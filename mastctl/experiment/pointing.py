@@ -1,7 +1,7 @@
 """The paper's pointing experiment (section IV, Table VI) through the HTTP interface of a running daemon.
 
-For each distance: turn to the ground, choose a textured pixel of the left image at random, ask the
-daemon to point at it twice, and take the residuals that the daemon measured in new images. A target that
+For each distance: turn to the ground, choose a textured pixel of the left image at random, have the
+daemon point at it twice, and take the residuals that the daemon measured in new images. A target that
 fails is a row of its own with the reason; it never leaves the record.
 """
 
@@ -11,7 +11,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -109,18 +109,11 @@ class PointingExperiment:
 
 def _row_as_json(row: DistanceSummary) -> dict[str, Any]:
     """One distance for programs."""
-    document: dict[str, Any] = {
-        "distance_m": row.distance_m,
-        "targets": row.targets,
-        "first_rms_px": row.first_rms_px,
-        "second_rms_px": row.second_rms_px,
-        "seconds": round(row.seconds, 2),
-        "failed": row.failed,
-        "worst_first_px": row.worst_first_px,
-    }
-    if row.true_first_rms_px is not None:
-        document["true_first_rms_px"] = row.true_first_rms_px
-        document["true_second_rms_px"] = row.true_second_rms_px
+    document = {
+        key: value
+        for key, value in vars(row).items()
+        if row.true_first_rms_px is not None or not key.startswith("true_")
+    } | {"seconds": round(row.seconds, 2)}
     paper = PAPER_TABLE_VI.get(row.distance_m)
     if paper is not None:
         document["paper_first_rms_px"], document["paper_second_rms_px"] = paper
@@ -153,18 +146,10 @@ def rms(pairs: Sequence[tuple[float, float]]) -> tuple[float, float] | None:
 
 
 class RunTime:
-    """The time of one run, which begins here.
+    """The daemon's time of one run: ``started`` is the date, ``where`` the daemon's address.
 
-    Durations are the daemon's, so that those of a simulated rover are what a rover would have taken. One
-    whose time passes only on demand (``simulation.speed: max``) knows no calendar and no address: the record
-    of such a run is to be the same every time.
-
-    Attributes
-    ----------
-    started
-        The date, or a sentence that there is none.
-    where
-        The daemon's address, or that it is simulated.
+    A simulated rover whose time passes only on demand (``simulation.speed: max``) has neither date nor
+    address: the record of such a run is to be the same every time.
     """
 
     def __init__(self, client: Client) -> None:
@@ -197,18 +182,11 @@ def on_demand(client: Client) -> bool:
 PAN_RANGE_RAD = 1.0
 
 
-class ClickTruth(Protocol):
-    """What only a simulation knows: where the clicked point really is in a later frame."""
+ClickTruth = Callable[[str, tuple[float, float], str, tuple[float, float]], tuple[float, float] | None]
+"""What only a simulation knows: the true residual (x, y) in pixels of a click, None if it hit the sky.
 
-    def residual_px(
-        self,
-        clicked_frame_id: str,
-        clicked_px: tuple[float, float],
-        landed_frame_id: str,
-        aim_px: tuple[float, float],
-    ) -> tuple[float, float] | None:
-        """Return the true residual (x, y) in pixels, or None if the click hit the sky."""
-        ...
+Called with the clicked frame's id and pixel, the later frame's id, and the pixel that was aimed at in it.
+"""
 
 
 def run_pointing_experiment(
@@ -227,25 +205,18 @@ def run_pointing_experiment(
 
     Parameters
     ----------
-    client
-        A client of the daemon that moves the mast.
-    targets
-        Targets at each distance.
+    targets, first
+        How many targets at each distance, and the number of the first.
     distances_m
-        Ranges from the camera to the ground where targets are looked for.
+        Ranges from the camera to the ground where targets are searched.
     seed
-        Chooses views and pixels; the same seed asks for the same views. Each target has a draw of its own,
-        whatever came before it.
-    truth
-        Where the click really is in a later frame; only a simulation knows.
+        Chooses views and pixels. Each target has a draw of its own, whatever came before it.
     notes
-        Sentences for the reader of the table, carried into the record.
+        Sentences for the reader of the table.
     on_target
         Called after each target, failed or not.
     pictures
-        How many targets of each distance keep their images in the record, for the report.
-    first
-        The number of the first target at each distance.
+        How many targets of each distance keep their images for the report.
 
     Raises
     ------
@@ -298,65 +269,47 @@ def head_pair(rig: Rig, served: set[str]) -> tuple[str, str]:
     return pairs.get("navcam") or next(iter(pairs.values()))
 
 
+@dataclass(frozen=True)
 class _PointingRun:
     """The running experiment: the daemon, the rig as the daemon believes it, the seed."""
 
-    def __init__(
-        self,
-        client: Client,
-        rig: Rig,
-        pair: tuple[str, str],
-        limits: Mapping[str, Any],
-        seed: int,
-        truth: ClickTruth | None,
-        clock: RunTime,
-    ) -> None:
-        self._clock = clock
-        self._client = client
-        self._rig = rig
-        self._pair = pair
-        self._limits = limits
-        self._seed = seed
-        self._truth = truth
+    client: Client
+    rig: Rig
+    pair: tuple[str, str]
+    limits: Mapping[str, Any]
+    seed: int
+    truth: ClickTruth | None
+    clock: RunTime
 
     def one_target(self, distance_m: float, index: int, with_pictures: bool) -> TargetRecord:
         """Find one target at the distance, point at it twice, and return the record of it."""
-        begun_s = self._clock.now_s()
-        rng = np.random.default_rng([self._seed, round(1000 * distance_m), index])
-        views = TargetViews(self._client, self._rig, self._pair, self._limits, rng, PAN_RANGE_RAD)
+        begun_s = self.clock.now_s()
+        rng = np.random.default_rng([self.seed, round(1000 * distance_m), index])
+        views = TargetViews(self.client, self.rig, self.pair, self.limits, rng, PAN_RANGE_RAD)
         reason = ""
         for _ in range(VIEWS_PER_TARGET):
             try:
                 target = views.find_target(distance_m)
             except ClientError as error:
-                reason = f"looking for a target: {error}"
+                reason = f"searching a target: {error}"
                 break
             if target is not None:
                 return self._point_at(target, distance_m, index, begun_s, with_pictures)
         reason = reason or f"no textured target found at {distance_m:g} m in {VIEWS_PER_TARGET} views"
         nan = math.nan
         return TargetRecord(
-            distance_m,
-            index,
-            self._pair[0],
-            "",
-            (nan, nan),
-            nan,
-            nan,
-            nan,
-            (),
-            reason,
-            self._clock.since_s(begun_s),
-        )
+            distance_m, index, self.pair[0], "", (nan, nan), nan, nan, nan, (), reason,
+            self.clock.since_s(begun_s),
+        )  # fmt: skip
 
     def _point_at(
         self, target: Target, distance_m: float, index: int, begun_s: float, with_pictures: bool
     ) -> TargetRecord:
-        """Ask the daemon for two pointings and write down what it measured."""
+        """Request two pointings and record what the daemon measured."""
         error, operation = "", None
         try:
             pixel = (target.shot.camera, target.shot.frame_id, target.x_px, target.y_px)
-            operation = pointed(self._client, pixel=pixel, pointings=2)
+            operation = pointed(self.client, pixel=pixel, pointings=2)
             if operation["state"] != "done":
                 reason = operation["error"] or {"code": operation["state"], "message": "stopped"}
                 error = f"{reason['code']}: {reason['message']}"
@@ -367,7 +320,7 @@ class _PointingRun:
         images: tuple[Image, ...] = ()
         if with_pictures:
             images = tuple(
-                self._client.snapshot(target.shot.camera, frame_id=landing.frame_id).image
+                self.client.snapshot(target.shot.camera, frame_id=landing.frame_id).image
                 for landing in landings
             )
         return TargetRecord(
@@ -381,7 +334,7 @@ class _PointingRun:
             tilt_before_rad=target.shot.tilt_rad,
             landings=landings,
             error=error,
-            seconds=self._clock.since_s(begun_s),
+            seconds=self.clock.since_s(begun_s),
             operation=operation or {},
             clicked_image=target.shot.image if with_pictures else None,
             landed_images=images,
@@ -389,16 +342,7 @@ class _PointingRun:
 
     def _landing(self, target: Target, entry: Mapping[str, Any]) -> Landing:
         """One entry of the operation's ``pointings``, with the true residual where it is known."""
-        aim_px = self._rig.cameras[self._pair[0]].model.image_center_px
-        true_px = None
-        if self._truth is not None:
-            true_px = self._truth.residual_px(
-                target.shot.frame_id, (target.x_px, target.y_px), str(entry["frame_id"]), aim_px
-            )
-        residual, sigma = entry["residual_px"], entry["residual_sigma_px"]
-        return Landing(
-            (float(residual[0]), float(residual[1])),
-            (float(sigma[0]), float(sigma[1])),
-            str(entry["frame_id"]),
-            true_px,
-        )
+        aim_px = self.rig.cameras[self.pair[0]].model.image_center_px
+        frame_id, clicked_px = str(entry["frame_id"]), (target.x_px, target.y_px)
+        true_px = self.truth and self.truth(target.shot.frame_id, clicked_px, frame_id, aim_px)
+        return Landing(tuple(entry["residual_px"]), tuple(entry["residual_sigma_px"]), frame_id, true_px)

@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,6 +22,7 @@ from drivers.simulation_clock import MAX
 from mastctl.config import Config, Listen, load_config, not_simulated
 from mastctl.devices.frames import camera_and_sequence
 from mastctl.experiment.pointing import (
+    ClickTruth,
     PointingExperiment,
     head_pair,
     run_pointing_experiment,
@@ -32,32 +34,19 @@ if TYPE_CHECKING:
     from mastctl.daemon import RunningDaemon
 
 
-def demo_config(
+def simulated_config(
     config: Config,
     *,
     head: str | None,
-    seed: int,
     wire: str | None = None,
-    bricks: int = 0,
     speed: float | str | None = None,
+    seed: int | None = None,
+    bricks: int = 0,
 ) -> Config:
-    """Return the packaged configuration on any free port, with the head, wire and seed of the demo.
+    """Return the configuration of a simulated rig on any free port; what is None stays as it is there.
 
-    None leaves the head to the wire, and the wire away: see `drivers.sim.rover`. ``bricks`` stand in
-    the scene. ``speed`` is `drivers.simulation_clock.simulation_speed`'s; without one nothing waits.
-    """
-    chosen = {key: value for key, value in (("head", head), ("wire", wire)) if value is not None}
-    packaged = {key: value for key, value in config.hardware.simulation.items() if key != "head"}
-    simulation = {**packaged, **chosen, "seed": seed, "speed": MAX if speed is None else speed}
-    if bricks:
-        simulation["scene"] = {**packaged.get("scene", {}), "bricks": bricks}
-    return replace(config, listen=Listen(port=0), hardware=replace(config.hardware, simulation=simulation))
-
-
-def own_config(
-    config: Config, *, head: str | None, wire: str | None, speed: float | str | None = None
-) -> Config:
-    """Return a simulated rig of one's own on any free port; what is None stays as it says.
+    A ``wire`` without a ``head`` has its usual one; ``bricks`` more stand in the scene. ``speed`` is
+    `drivers.simulation_clock.simulation_speed`'s.
 
     Raises
     ------
@@ -69,10 +58,12 @@ def own_config(
         name, driver = real
         message = f"driver {driver!r} where the demo expects a simulated device, of which it knows the truth"
         raise BadOptions(message, device=name)
-    given = (("head", head), ("wire", wire), ("speed", speed))
-    chosen = {key: value for key, value in given if value is not None}
-    kept = {key: value for key, value in hardware.simulation.items() if key != "head" or wire is None}
-    return replace(config, listen=Listen(port=0), hardware=replace(hardware, simulation={**kept, **chosen}))
+    given = (("head", head), ("wire", wire), ("speed", speed), ("seed", seed))
+    simulation = {key: value for key, value in hardware.simulation.items() if key != "head" or wire is None}
+    simulation |= {key: value for key, value in given if value is not None}
+    if bricks:
+        simulation["scene"] = {**simulation.get("scene", {}), "bricks": bricks}
+    return replace(config, listen=Listen(port=0), hardware=replace(hardware, simulation=simulation))
 
 
 def head_note(rover: RoverModel, rig: Rig, camera: str) -> str:
@@ -95,29 +86,26 @@ def head_note(rover: RoverModel, rig: Rig, camera: str) -> str:
     return f"{sentence}, not taken up: a residual of up to {own_px:.1f} px an axis is the head's own."
 
 
-class SimulationTruth:
-    """Where a clicked point really is in a later frame (`mastctl.experiment.pointing.ClickTruth`)."""
+def simulation_truth(rover: RoverModel) -> ClickTruth:
+    """Return the truth about clicks in this rover's frames."""
 
-    def __init__(self, rover: RoverModel) -> None:
-        self._rover = rover
-        self._points: dict[tuple[str, tuple[float, float]], FloatArray | None] = {}
+    @cache
+    def point(frame_id: str, clicked_px: tuple[float, float]) -> FloatArray | None:
+        return rover.true_point(*camera_and_sequence(frame_id), clicked_px)
 
     def residual_px(
-        self,
         clicked_frame_id: str,
         clicked_px: tuple[float, float],
         landed_frame_id: str,
         aim_px: tuple[float, float],
     ) -> tuple[float, float] | None:
-        """Return the true residual (x, y) in pixels, or None if the click hit the sky."""
-        key = (clicked_frame_id, clicked_px)
-        if key not in self._points:
-            self._points[key] = self._rover.true_point(*camera_and_sequence(clicked_frame_id), clicked_px)
-        point = self._points[key]
-        if point is None:
+        clicked_m = point(clicked_frame_id, clicked_px)
+        if clicked_m is None:
             return None
-        x, y = self._rover.true_pixel(*camera_and_sequence(landed_frame_id), point)
+        x, y = rover.true_pixel(*camera_and_sequence(landed_frame_id), clicked_m)
         return float(x) - aim_px[0], float(y) - aim_px[1]
+
+    return residual_px
 
 
 @dataclass(frozen=True)
@@ -146,7 +134,9 @@ def running_rover(rover: Rover) -> Iterator[tuple[RunningDaemon, Client, RoverMo
     from mastctl.client import Client
     from mastctl.daemon import RunningDaemon  # late: `mastctl demo` compiles its renderer meanwhile
 
-    config = demo_config(load_config(None), head=rover.head, seed=rover.seed, bricks=rover.bricks)
+    config = simulated_config(
+        load_config(None), head=rover.head, seed=rover.seed, bricks=rover.bricks, speed=MAX
+    )
     with tempfile.TemporaryDirectory() as folder:
         if rover.mast_file is not None:
             config = replace(config, mast_file=Path(folder) / "mast.yaml")
@@ -166,7 +156,7 @@ def one_pointing(task: PointingTask) -> PointingExperiment:
             targets=1,
             distances_m=(task.distance_m,),
             seed=task.rover.seed,
-            truth=SimulationTruth(rover),
+            truth=simulation_truth(rover),
             notes=(head_note(rover, rig, camera),),
             pictures=int(task.pictures),
             first=task.index,

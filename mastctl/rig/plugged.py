@@ -11,7 +11,7 @@ from drivers.errors import DriverError
 from drivers.probes import ProbedCamera, ProbedHead
 from drivers.registry import drivers_of
 from drivers.servo_bus.bench import FoundServo, ServoBench, ServosOnLine
-from mastctl.setup.machine import ExaminedMachine, examine_port
+from mastctl.setup.machine import ExaminedMachine, examine_port, serial_lines
 
 MOST_CAMERAS = 2
 NO_POWER = "; is its power on?"
@@ -85,14 +85,6 @@ def look(
     for one in cameras[MOST_CAMERAS:]:
         unused.append(f"{one.summary}: a head has {MOST_CAMERAS} cameras at most here; {BY_HAND}")
     return Plugged(tuple(heads), tuple(cameras[:MOST_CAMERAS]), (*unused, *no_cameras))
-
-
-def serial_lines(machine: ExaminedMachine) -> list[str]:
-    """Return the USB serial adapters of a machine, each by its stable name where udev gives one."""
-    named = {link.resolve(): link for link in sorted(machine.at("/dev/serial/by-id").glob("*"))}
-    devices = sorted([*machine.at("/dev").glob("ttyUSB*"), *machine.at("/dev").glob("ttyACM*")])
-    found = [named.get(device.resolve(), device) for device in devices]
-    return [f"/{path.relative_to(machine.root)}" for path in found]
 
 
 def ask_line(port: str, machine: ExaminedMachine) -> tuple[ProbedHead | None, str]:

@@ -164,14 +164,14 @@ def examine_descriptors() -> DoctorFinding:
 
 SLOWEST_MS = 2  # of an adapter's latency timer: at 50 readings a second 16 ms are most of the time there is
 _NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
-_ADAPTERS = {
-    "0403": "FTDI",
-    "fff1": "ROBOTIS",
-    "2f5d": "ROBOTIS",
-    "10c4": "Silicon Labs",
-    "1a86": "WCH",
-    "067b": "Prolific",
-}
+
+
+def serial_lines(machine: ExaminedMachine) -> list[str]:
+    """Return the USB serial adapters of a machine, each by its stable name where udev gives one."""
+    stable = {link.resolve(): link for link in sorted(machine.at("/dev/serial/by-id").glob("*"))}
+    devices = sorted([*machine.at("/dev").glob("ttyUSB*"), *machine.at("/dev").glob("ttyACM*")])
+    found = [stable.get(device.resolve(), device) for device in devices]
+    return [f"/{path.relative_to(machine.root)}" for path in found]
 
 
 def examine_port(port: str, machine: ExaminedMachine) -> Iterator[DoctorFinding]:
@@ -183,11 +183,12 @@ def examine_port(port: str, machine: ExaminedMachine) -> Iterator[DoctorFinding]
         return
     path = machine.at(port)
     if not path.exists():
-        there = _connected(machine)
+        connected = ", ".join(serial_lines(machine))
+        present = f"connected: {connected}" if connected else "no USB serial adapter is connected"
         yield DoctorFinding(
             "port",
             "bad",
-            f"{port} does not exist; {there}",
+            f"{port} does not exist; {present}",
             "plug the adapter in, or name the port as it is called here",
         )
         return
@@ -264,27 +265,6 @@ def _latency(port: str, path: Path, machine: ExaminedMachine) -> Iterator[Doctor
         "install configs/udev/60-mastctl.rules, or: "
         f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{path.resolve().name}/latency_timer",
     )
-
-
-def _connected(machine: ExaminedMachine) -> str:
-    """The serial devices that are there, with the makers of their adapters."""
-    found = []
-    for device in sorted([*machine.at("/dev").glob("ttyUSB*"), *machine.at("/dev").glob("ttyACM*")]):
-        vendor = _vendor(device, machine)
-        found.append(f"/dev/{device.name}{f' ({vendor})' if vendor else ''}")
-    return f"there are {', '.join(found)}" if found else "no USB serial adapter is connected"
-
-
-def _vendor(device: Path, machine: ExaminedMachine) -> str:
-    """The maker of a USB serial device, by the numbers that its parents in sysfs tell."""
-    place = machine.at(f"/sys/class/tty/{device.name}/device").resolve()
-    for folder in (place, *place.parents):
-        number = folder / "idVendor"
-        if number.is_file():
-            return _ADAPTERS.get(number.read_text().strip(), "")
-        if folder == machine.root:
-            break
-    return ""
 
 
 def _group(number: int) -> str:

@@ -32,7 +32,7 @@ from mastctl.client import Client, ClientError, Snapshot
 from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.frames import camera_and_sequence
-from mastctl.experiment.simulated import own_config
+from mastctl.experiment.simulated import simulated_config
 from mastctl.experiment.targets import BORDER_PX
 from mastctl.packaged import config_folder
 from tools.command import end, options, rms, show
@@ -83,7 +83,7 @@ class TrueClick:
 
 def config_of(day: str, scene_seed: int) -> Config:
     """The packaged rover with its Navcams on such a day, in a scene of its own."""
-    config = own_config(load_config(config_folder() / DAYS[day]), head=None, wire=None, speed=MAX)
+    config = simulated_config(load_config(config_folder() / DAYS[day]), head=None, wire=None, speed=MAX)
     simulation = {**config.hardware.simulation, "seed": scene_seed}
     cameras = {name: config.hardware.cameras[name] for name in (LEFT, RIGHT)}
     return replace(config, hardware=replace(config.hardware, simulation=simulation, cameras=cameras))

@@ -28,7 +28,7 @@ from mastctl.client import Client
 from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.pointing import PointingExperiment, TargetRecord, run_pointing_experiment
-from mastctl.experiment.simulated import SimulationTruth
+from mastctl.experiment.simulated import simulation_truth
 from mastctl.packaged import config_folder
 from tools.command import end, numbers, options, rms, show
 
@@ -117,7 +117,7 @@ def point(variant: Variant) -> PointingExperiment:
             first=variant.index,
             distances_m=(variant.distance_m,),
             seed=variant.seed,
-            truth=SimulationTruth(rover),
+            truth=simulation_truth(rover),
         )
 
 

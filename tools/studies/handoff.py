@@ -26,7 +26,7 @@ from mastctl.cli.output import check_folder
 from mastctl.cli.tasks import check_place, results_of, run_bar
 from mastctl.client import Client
 from mastctl.config import load_config
-from mastctl.experiment.simulated import Rover, SimulationTruth, running_rover
+from mastctl.experiment.simulated import Rover, running_rover, simulation_truth
 from mastctl.watch.handoffs import handoff_log
 from tools.command import end, options, show
 from tools.studies.handoff_run import STEPS, HandoffRecord, run_handoff_experiment
@@ -61,7 +61,7 @@ def one_handoff(task: HandoffTask) -> list[HandoffRecord]:
             client,
             targets=1,
             seed=task.rover.seed,
-            truth=SimulationTruth(rover),
+            truth=simulation_truth(rover),
             first=task.index,
             chosen=(task.source,),
         )

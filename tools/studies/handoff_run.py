@@ -187,4 +187,4 @@ class _HandoffRun:
         if self.truth is None:
             return None
         exact = (target.x_px, target.y_px)
-        return self.truth.residual_px(target.shot.frame_id, exact, shot.frame_id, (0.0, 0.0))
+        return self.truth(target.shot.frame_id, exact, shot.frame_id, (0.0, 0.0))

@@ -231,7 +231,7 @@ def test_there_is_a_broken_head_for_every_test() -> None:
 
 def test_a_head_that_hangs_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     go = threading.Event()
-    monkeypatch.setattr("mastctl.testing.drivers.calls.Worker.call.__defaults__", (0.2,))
+    monkeypatch.setattr("mastctl.testing.drivers.calls.call.__defaults__", (0.2,))
 
     class Hangs(Right):
         def read(self) -> Reading:

@@ -232,7 +232,7 @@ class WorldTruth:
         self._world = world
         self._client = client
 
-    def residual_px(
+    def __call__(
         self,
         clicked_frame_id: str,
         clicked_px: tuple[float, float],

@@ -1,9 +1,7 @@
-"""Calls of a device under test in a thread of its own, as the service makes them, each with a deadline."""
+"""Calls of a device under test in threads of their own, each with a deadline."""
 
 from __future__ import annotations
 
-import queue
-import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import TypeVar
@@ -19,48 +17,30 @@ T = TypeVar("T")
 PATIENCE_S = 12.0
 
 
-class Worker:
-    """One thread that makes a device's calls."""
-
-    def __init__(self) -> None:
-        self._calls: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        threading.Thread(target=self._serve, name="device under test", daemon=True).start()
-
-    def call(self, what: str, function: Callable[[], T], patience_s: float = PATIENCE_S) -> T:
-        """Make a call in the device's thread. Raises as `ended`."""
-        future, run = _task(function)
-        self._calls.put(run)
-        return ended(what, future, patience_s)
-
-    def close(self) -> None:
-        """Let the thread end when its last call is back."""
-        self._calls.put(None)
-
-    def _serve(self) -> None:
-        while (run := self._calls.get()) is not None:
-            run()
+def call(what: str, function: Callable[[], T], patience_s: float = PATIENCE_S) -> T:
+    """Make a call in a thread of its own and wait for it. Raises as `ended`."""
+    return ended(what, beside(function), patience_s)
 
 
 def beside(function: Callable[[], T], clock: Clock | None = None) -> Future[T]:
-    """Make a call in a thread of its own, one of the clock's, beside those of the device's thread."""
-    future, run = _task(function)
-    (clock or SystemClock()).thread(run, "beside the device under test").start()
+    """Begin a call in a thread of its own, one of the clock's, and return at once."""
+    future: Future[T] = Future()
+
+    def run() -> None:
+        try:
+            future.set_result(function())
+        except BaseException as error:  # a foreign driver may raise anything; the caller gets it
+            future.set_exception(error)
+
+    (clock or SystemClock()).thread(run, "device under test").start()
     return future
 
 
 def ended(what: str, future: Future[T], patience_s: float = PATIENCE_S) -> T:
-    """Return what a call returned.
+    """Return what a call returned; raise the driver's own DriverError.
 
-    Raises
-    ------
-    DriverError
-        What the driver raised.
-    NotTried
-        If the limits or keep-outs refused a move.
-    PromiseBroken
-        If anything else was raised.
-    SubjectLost
-        If the call does not come back.
+    Raises NotTried if limits or keep-outs refused a move, PromiseBroken for any other error, SubjectLost if
+    the call does not come back.
     """
     try:
         return future.result(patience_s)
@@ -77,16 +57,3 @@ def ended(what: str, future: Future[T], patience_s: float = PATIENCE_S) -> T:
         raise PromiseBroken(
             f"{what} raised {type(error).__name__} ({message}) where a DriverError is expected"
         ) from error
-
-
-def _task(function: Callable[[], T]) -> tuple[Future[T], Callable[[], None]]:
-    """A future, and the function that fills it."""
-    future: Future[T] = Future()
-
-    def run() -> None:
-        try:
-            future.set_result(function())
-        except BaseException as error:  # a foreign driver may raise anything; the caller gets it
-            future.set_exception(error)
-
-    return future, run

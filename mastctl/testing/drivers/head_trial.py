@@ -15,7 +15,7 @@ from mastctl.conform.checks import NotTried, SubjectLost, expect
 from mastctl.conform.rig import Angles
 from mastctl.devices.frames import CLOCK_TOLERANCE_S
 from mastctl.devices.opening import GuardedHead
-from mastctl.testing.drivers.calls import Worker
+from mastctl.testing.drivers.calls import call
 
 LONGER = "a larger --reach or a lower --speed"
 SETTLES_WITHIN_S = 30.0
@@ -26,34 +26,24 @@ OUTSIDE_COUNT_RAD = 1e-3
 
 @dataclass
 class HeadTrial:
-    """A head under test, and what is known of it.
+    """A head under test, and what is known of it. Angles are (pan, tilt).
 
     Attributes
     ----------
-    head
-        The driver's object.
     box_rad
         Where it may be moved: lowest and highest pan, lowest and highest tilt.
-    speed_rad_per_s
-        How fast.
     limits_rad
         The ends of each axis, where the head is to be sent too; None: it is not.
     own_limits
         Whether they are the driver's own, so that it refuses goals beyond them.
-    count_rad
-        One count; None: not known.
     settle_rad
-        How far from its goal a settled head may stand, beyond the rounding to counts.
+        How far from its goal a settled head may be, beyond the rounding to counts.
     true_rad
         Where the axes truly are at a moment of the last minute; None where that is not known.
     open_again
         Opens the same head once more after it was closed; None where that is not to be tried.
-    closed
-        Whether it was closed for good.
     unplaced
         Why it is not known where it may be moved; empty where it is.
-    clock
-        What the head stamps its readings by, and what the tests wait on.
     """
 
     head: PanTilt
@@ -68,7 +58,6 @@ class HeadTrial:
     closed: bool = False
     unplaced: str = ""
     clock: Clock = field(default_factory=SystemClock)
-    worker: Worker = field(default_factory=Worker)
 
     @property
     def near_rad(self) -> float:
@@ -83,25 +72,25 @@ class HeadTrial:
         return a + (pan_part + 1) / 2 * (b - a), c + (tilt_part + 1) / 2 * (d - c)
 
     def read(self) -> Reading:
-        """Read in the head's own thread; the reading is one that can be true."""
+        """Read; the reading is one that can be true."""
         began_s = self.clock.now_s()
-        reading = self.worker.call("read()", self.head.read)
+        reading = call("read()", self.head.read)
         self.check_reading(reading, began_s, self.clock.now_s())
         return reading
 
     def move(self, goal: Angles, speed_rad_per_s: float | None = None) -> None:
         """Send the head to a goal."""
         speed = self.speed_rad_per_s if speed_rad_per_s is None else speed_rad_per_s
-        self.worker.call("move()", lambda: self.head.move(goal[0], goal[1], speed))
+        call("move()", lambda: self.head.move(goal[0], goal[1], speed))
 
     def try_refusal(self, goal: Angles, speed_rad_per_s: float) -> None:
         """Send a goal or speed that the driver has to refuse."""
         move = self.head.try_refusal if isinstance(self.head, GuardedHead) else self.head.move
-        self.worker.call("move()", lambda: move(goal[0], goal[1], speed_rad_per_s))
+        call("move()", lambda: move(goal[0], goal[1], speed_rad_per_s))
 
     def stop(self) -> None:
-        """Stop, in the head's own thread."""
-        self.worker.call("stop()", self.head.stop)
+        """Stop where it is."""
+        call("stop()", self.head.stop)
 
     def check_reading(self, reading: Reading, began_s: float, ended_s: float) -> None:
         """Pass a reading of a call that can be true. Raises PromiseBroken."""

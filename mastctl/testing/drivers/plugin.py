@@ -163,24 +163,9 @@ def head_under_test(
 ) -> Iterator[HeadTrial]:  # fmt: skip
     """Open a head whose moves are judged (`mastctl.devices.opening`); leaving closes it.
 
-    Parameters
-    ----------
-    settings
-        What opens it.
-    bounds
-        Of its configuration; None: it has none.
-    reach_rad, speed_rad_per_s
-        How far from its pose it may be moved (infinite: over all of the limits), and how fast.
-    own_limits_rad
-        The driver's own ends, where they are known: it is sent to them, and just beyond, which it has to
-        refuse.
-    moves
-        Whether it is to be moved at all.
-
-    Raises
-    ------
-    Estopped, StateInUse, DriverError
-        As `mastctl.devices.opening.devices_beside`.
+    An infinite ``reach_rad`` is all of the limits. ``own_limits_rad`` are the driver's own ends, where they
+    are known: the head is sent to them, and just beyond, which its driver has to refuse. Raises as
+    `mastctl.devices.opening.devices_beside`.
     """
     ends = own_limits_rad or ANYWHERE
     if bounds is None:
@@ -214,10 +199,7 @@ def head_under_test(
                     box(first.pan_rad, free.pan_rad, reach_rad),
                     box(first.tilt_rad, free.tilt_rad, reach_rad),
                 )
-        try:
-            yield trial
-        finally:
-            trial.worker.close()
+        yield trial
 
 
 def device_settings(driver: str, options: Mapping[str, Any], kind: str, name: str) -> HardwareSettings:

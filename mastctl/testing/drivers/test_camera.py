@@ -16,7 +16,7 @@ from mastctl.conform.checks import NotTried, PromiseBroken, expect
 from mastctl.conform.settings_trial import settings_tried
 from mastctl.devices import frames as frame_checks
 from mastctl.setup.camera_check import FRAME_TIMEOUT_S, GRACE_S, CameraCheck
-from mastctl.testing.drivers.calls import beside, ended
+from mastctl.testing.drivers.calls import beside, call, ended
 
 log = logging.getLogger(__name__)
 
@@ -27,18 +27,10 @@ FRAMES_EACH = 5
 
 @dataclass
 class CameraTrial:
-    """A camera under test.
+    """A camera under test; frames are taken for ``seconds``.
 
-    Attributes
-    ----------
-    name, driver
-        What it is called, and the driver's object.
-    size_px
-        (width, height) of its images; None where that is not known.
-    seconds
-        How long frames are taken, one after the other.
-    open_again
-        Opens the same camera once more after it was closed; None where that is not to be tried.
+    ``size_px`` is (width, height), None where that is not known; ``open_again`` opens the same camera once
+    more after it was closed, None where that is not to be tried.
     """
 
     name: str
@@ -106,9 +98,9 @@ def test_threads(camera: CameraTrial) -> None:
         for _ in range(FRAMES_EACH):
             camera.frame(camera.driver)
 
-    for call in [beside(work) for _ in range(2)]:
+    for one in [beside(work) for _ in range(2)]:
         try:
-            ended("next_frame() beside another", call, FRAMES_EACH * (FRAME_TIMEOUT_S + GRACE_S))
+            ended("next_frame() beside another", one, FRAMES_EACH * (FRAME_TIMEOUT_S + GRACE_S))
         except DriverError as error:
             raise PromiseBroken(f"next_frame() beside another: {error}") from None
 
@@ -117,8 +109,8 @@ def test_settings(camera: CameraTrial) -> None:
     """A setting that is changed by a little is read back, on new frames, and put back."""
     driver = camera.driver
     tried = settings_tried(
-        lambda: ended("settings()", beside(driver.settings)),
-        lambda name, value: ended("adjust()", beside(lambda: driver.adjust({name: value}))),
+        lambda: call("settings()", driver.settings),
+        lambda name, value: call("adjust()", lambda: driver.adjust({name: value})),
         lambda: camera.frame(driver).settings,
     )
     log.info(tried)
@@ -132,7 +124,7 @@ def test_close(camera: CameraTrial) -> None:
     began_s = time.monotonic()
     for name in ("close()", "a second close()"):
         try:
-            ended(name, beside(driver.close))
+            call(name, driver.close)
         except DriverError as error:
             raise PromiseBroken(f"{name} raised {type(error).__name__}: {error}") from None
     try:
@@ -142,7 +134,7 @@ def test_close(camera: CameraTrial) -> None:
         took_s = time.monotonic() - began_s
     expect(took_s < CLOSES_WITHIN_S, f"close, and the call that waited, took {took_s:.1f} s")
     try:
-        ended("next_frame() of a closed camera", beside(lambda: driver.next_frame(time.monotonic(), 1.0)))
+        call("next_frame() of a closed camera", lambda: driver.next_frame(time.monotonic(), 1.0))
     except DriverError:
         pass
     else:
@@ -150,5 +142,5 @@ def test_close(camera: CameraTrial) -> None:
     if camera.open_again is None:
         return
     camera.driver = camera.open_again()
-    ended("next_frame()", beside(lambda: camera.frame(camera.driver)))
+    call("next_frame()", lambda: camera.frame(camera.driver))
     log.info(f"within {took_s:.2f} s, and opened again")

@@ -15,7 +15,7 @@ from drivers.errors import BadReply, DriverError, NoReply
 from mastctl.conform.checks import NotTried, PromiseBroken, expect
 from mastctl.conform.rig import Angles
 from mastctl.devices.devices import MOVE_TIMEOUT_S, READ_TIMEOUT_S, STOP_TIMEOUT_S
-from mastctl.testing.drivers.calls import PATIENCE_S, beside, ended
+from mastctl.testing.drivers.calls import PATIENCE_S, beside, call, ended
 from mastctl.testing.drivers.head_trial import (
     LONGER,
     OUTSIDE_COUNT_RAD,
@@ -213,9 +213,9 @@ def test_threads(head: HeadTrial) -> None:
             if moves:
                 head.head.move(*goal, head.speed_rad_per_s)
 
-    for call in [beside(partial(work, moves), head.clock) for moves in (True, False, False, False)]:
+    for one in [beside(partial(work, moves), head.clock) for moves in (True, False, False, False)]:
         try:
-            ended("a call beside others", call, 2 * PATIENCE_S)
+            ended("a call beside others", one, 2 * PATIENCE_S)
         except DriverError as error:
             raise PromiseBroken(f"a call beside others failed: {error}") from None
     off_rad = away(head.settled(), goals[-1])
@@ -319,7 +319,7 @@ def test_deadlines(head: HeadTrial) -> None:
     """Every call ends within half of the time that the service gives it."""
     goal = head.goal(0.2, -0.1)
     measured = []
-    for name, call, deadline_s in (
+    for name, function, deadline_s in (
         ("read", head.read, READ_TIMEOUT_S),
         ("move", lambda: head.move(goal), MOVE_TIMEOUT_S),
         ("read", head.read, READ_TIMEOUT_S),
@@ -328,7 +328,7 @@ def test_deadlines(head: HeadTrial) -> None:
         took_s = []
         for _ in range(3):
             began_s = head.clock.now_s()
-            call()
+            function()
             took_s.append(head.clock.now_s() - began_s)
         expect(min(took_s) < deadline_s / 2, f"{name}() took {min(took_s):.2f} s of {deadline_s:g} s at best")
         measured.append(f"{name} {1e3 * min(took_s):.1f} ms")
@@ -341,13 +341,13 @@ def test_close(head: HeadTrial) -> None:
     head.sent(head.goal(-0.9, -0.9))
     goal = head.goal(0.9, 0.9)
     head.on_its_way(goal)
-    for call in ("close()", "a second close()"):
+    for name in ("close()", "a second close()"):
         try:
-            head.worker.call(call, head.head.close)
+            call(name, head.head.close)
         except DriverError as error:
-            raise PromiseBroken(f"{call} raised {type(error).__name__}: {error}") from None
+            raise PromiseBroken(f"{name} raised {type(error).__name__}: {error}") from None
     with suppress(DriverError):
-        head.worker.call("read() of a closed head", head.head.read)
+        call("read() of a closed head", head.head.read)
         raise PromiseBroken("a closed head gave a reading")
     if head.open_again is None:
         head.closed = True
