@@ -1,10 +1,12 @@
-"""The frames of a camera compared with what a driver promises, and the quality of its images."""
+"""The frames of a camera compared with what a driver promises, and the quality of its images.
+
+``mastctl camera check`` reports it, and the acceptance of drivers (`mastctl.testing.drivers`) asserts it.
+"""
 
 from __future__ import annotations
 
 import statistics
 import time
-from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -21,20 +23,15 @@ from mastctl.devices.thread import DeviceThread
 
 FRAME_TIMEOUT_S = 5.0
 GRACE_S = 6.0  # beyond that a call hangs: the service gives it no more either
-NEVER_S, SHORT_S = 60.0, 0.2  # asked for a frame of the future, and how long: it must be refused in time
+NEVER_S, SHORT_S = 60.0, 0.2  # how far in the future a frame is requested, and how long: refused in time
 PACE_TOLERANCE = 0.2
 MOST_PROBLEMS = 20
 
 
 class CameraCheck:
-    """One check of one open camera.
+    """One check of one open camera; its stamps are judged by ``clock``.
 
-    Parameters
-    ----------
-    name, camera, clock
-        The camera, and the clock that its stamps are judged by.
-    size_px
-        (width, height) by the mast file; None where that does not know it.
+    ``size_px`` is (width, height) by the mast file, None where that does not know it.
     """
 
     def __init__(self, name: str, camera: Camera, clock: Clock, size_px: tuple[int, int] | None) -> None:
@@ -56,7 +53,7 @@ class CameraCheck:
         thread = DeviceThread(self._name)
         try:
             self._take_frames(thread, seconds)
-            self._ask_for_the_future(thread)
+            self._request_the_future(thread)
         finally:
             thread.close(1.0)
         self._check_count()
@@ -70,11 +67,11 @@ class CameraCheck:
         ``order`` (count and time grow together), ``refusal`` (what cannot come is refused in time) and
         ``stated`` (what the camera states of itself).
         """
-        return [words for about, words in self._problems if promise in (None, about)]
+        return [message for about, message in self._problems if promise in (None, about)]
 
-    def _problem(self, promise: str, words: str) -> None:
-        if words not in self.problems() and len(self._problems) < MOST_PROBLEMS:
-            self._problems.append((promise, words))
+    def _problem(self, promise: str, message: str) -> None:
+        if message not in self.problems() and len(self._problems) < MOST_PROBLEMS:
+            self._problems.append((promise, message))
 
     def _next(self, thread: DeviceThread, after_s: float, timeout_s: float) -> Any:
         """The driver's answer, within a deadline. Raises DriverError."""
@@ -107,19 +104,19 @@ class CameraCheck:
             self._delays_s.append(now_s - (frame.mid_exposure_s + frame.exposure_s / 2))
             after_s = now_s if len(self._frames) % 5 == 0 else frame.exposure_began_s
 
-    def _ask_for_the_future(self, thread: DeviceThread) -> None:
+    def _request_the_future(self, thread: DeviceThread) -> None:
         """A frame exposed after a minute from now cannot come; the driver has to say so in time."""
         began_s = time.monotonic()
-        words = f"asked for a frame exposed in {NEVER_S:g} s, within {SHORT_S:g} s"
+        request = f"requested a frame exposed in {NEVER_S:g} s, within {SHORT_S:g} s"
         try:
             self._next(thread, self._clock.now_s() + NEVER_S, SHORT_S)
-            self._problem("refusal", f"{words}, it gave one that was exposed before")
+            self._problem("refusal", f"{request}: one came that was exposed before")
         except NoFreshFrame:
             took_s = time.monotonic() - began_s
             if took_s > SHORT_S + 1.0:
-                self._problem("refusal", f"{words}, it said no only after {took_s:.1f} s")
+                self._problem("refusal", f"{request}: refused only after {took_s:.1f} s")
         except DriverError as error:
-            self._problem("refusal", f"{words}, it raised no NoFreshFrame: {error}")
+            self._problem("refusal", f"{request}: no NoFreshFrame was raised: {error}")
 
     def _check_count(self) -> None:
         """Count and time must grow together."""
@@ -138,12 +135,12 @@ class CameraCheck:
         if info.size_px is not None and self._frames:
             height, width = self._frames[-1].image.shape[:2]
             if tuple(info.size_px) != (width, height):
-                words = f"info.size_px is {tuple(info.size_px)}, its pictures have ({width}, {height})"
-                self._problem("stated", words)
+                message = f"info.size_px is {tuple(info.size_px)}, its images have ({width}, {height})"
+                self._problem("stated", message)
         rate_hz, period_s = self._rate_hz(), info.period_s
         if period_s is not None and rate_hz and abs(period_s * rate_hz - 1) > PACE_TOLERANCE:
-            words = f"info.period_s is {period_s:.4g} s, frames come every {1 / rate_hz:.4g} s"
-            self._problem("stated", words)
+            message = f"info.period_s is {period_s:.4g} s, frames come every {1 / rate_hz:.4g} s"
+            self._problem("stated", message)
 
     def _rate_hz(self) -> float | None:
         if len(self._frames) < 2:
@@ -161,7 +158,7 @@ class CameraCheck:
             "refused": self._refused,
             "rate_hz": self._rate_hz(),
             "mid_exposure_uncertainty_s": self._uncertainty_s,
-            "abilities": [word for word in STATED if getattr(info, word) is not None],
+            "abilities": [name for name in STATED if getattr(info, name) is not None],
             "problems": self.problems(),
         }
         if isinstance(info.sensor_mode, SensorMode):
@@ -174,7 +171,7 @@ class CameraCheck:
                 "missed": sum(max(0, b.sequence - a.sequence - 1) for a, b in pairwise(frames)),
                 "delay_s": [min(self._delays_s), statistics.median(self._delays_s), max(self._delays_s)],
                 "exposure_s": [min(f.exposure_s for f in frames), max(f.exposure_s for f in frames)],
-                "quality": asdict(quality_of(image)),
+                "quality": quality_of(image),
             }
         return summary
 
@@ -184,47 +181,28 @@ BINS = 16
 DARK, SATURATED = 5, 250
 
 
-@dataclass(frozen=True)
-class Quality:
-    """Exposure and sharpness of one picture.
+def quality_of(image: Image) -> dict[str, Any]:
+    """Return exposure and sharpness of an image, uint8 (h, w) or (h, w, 3) BGR.
 
-    Attributes
-    ----------
-    histogram
-        Share of the pixels in 16 equal ranges of grey level, 0 to 255.
-    mean, median
-        Grey levels.
-    dark_share, saturated_share
-        Share of the pixels at or below 5, and at or above 250.
-    sharpness
-        Variance of the Laplacian: compare it only between pictures of the same scene and exposure.
+    ``histogram`` has the shares of the pixels in 16 equal ranges of grey level, 0 to 255; ``dark_share`` and
+    ``saturated_share`` are those at or below 5, and at or above 250. ``sharpness`` is the variance of the
+    Laplacian: compare it only between images of the same scene and exposure.
     """
-
-    histogram: tuple[float, ...]
-    mean: float
-    median: float
-    dark_share: float
-    saturated_share: float
-    sharpness: float
-
-
-def quality_of(image: Image) -> Quality:
-    """Return exposure and sharpness of a picture, uint8 (h, w) or (h, w, 3) BGR."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     counts = np.bincount(grey.ravel(), minlength=256)
     shares = counts / grey.size
-    return Quality(
-        histogram=tuple(float(share) for share in shares.reshape(BINS, -1).sum(axis=1)),
-        mean=float(shares @ np.arange(256)),
-        median=float(np.searchsorted(np.cumsum(counts), grey.size / 2)),
-        dark_share=float(shares[: DARK + 1].sum()),
-        saturated_share=float(shares[SATURATED:].sum()),
-        sharpness=sharpness(image),
-    )
+    return {
+        "histogram": shares.reshape(BINS, -1).sum(axis=1).tolist(),
+        "mean": float(shares @ np.arange(256)),
+        "median": float(np.searchsorted(np.cumsum(counts), grey.size / 2)),
+        "dark_share": float(shares[: DARK + 1].sum()),
+        "saturated_share": float(shares[SATURATED:].sum()),
+        "sharpness": sharpness(image),
+    }
 
 
 def sharpness(image: Image, around_px: tuple[float, float] | None = None, half_px: int = 100) -> float:
-    """Return the variance of the Laplacian, of the whole picture or of a square around a pixel (x, y)."""
+    """Return the variance of the Laplacian, of the whole image or of a square around a pixel (x, y)."""
     grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     if around_px is not None:
         x, y = (round(value) for value in around_px)

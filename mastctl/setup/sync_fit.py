@@ -14,7 +14,9 @@ oppositely on either way; going at several speeds tells o from h, since only o g
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,20 +39,11 @@ UNEXPLAINED = 0.15  # of the patches' own motion, rms: then pictures did not mov
 
 @dataclass(frozen=True)
 class OffsetFit:
-    """What came out.
+    """The offset, to be added to the frames' stamps, with one sigma, and what was fitted beside it.
 
-    Attributes
-    ----------
-    offset_s, sigma_s
-        Add it to the frames' stamps; one sigma.
-    rolling_s, rolling_sigma_s
-        From the top of the picture to its bottom, by a rolling shutter; None if all patches lie in few rows.
-    play_rad, play_sigma_rad
-        Of the gears, both sides together, as the pictures show it.
-    frames, patches, legs
-        How many of each told something.
-    rms_px
-        What the model leaves, one axis.
+    ``rolling_s``: from the top of the image to its bottom, by a rolling shutter; None if all patches are in
+    few rows. ``play_rad``: of the gears, both sides together. ``frames``, ``patches`` and ``legs`` are those
+    that were used; ``rms_px`` is what the model leaves, one axis.
     """
 
     offset_s: float
@@ -65,17 +58,6 @@ class OffsetFit:
     rms_px: float
 
 
-@dataclass(frozen=True, eq=False)
-class _Problem:
-    """What was measured, as `fit_offset` takes it, and which of (o, c, h) are free."""
-
-    motion: JointMotion
-    stamps_s: FloatArray
-    places_px: FloatArray
-    rows: FloatArray
-    free: NDArray[np.bool_]
-
-
 def fit_offset(
     motion: JointMotion, stamps_s: FloatArray, places_px: FloatArray, rows: FloatArray
 ) -> OffsetFit:
@@ -83,8 +65,6 @@ def fit_offset(
 
     Parameters
     ----------
-    motion
-        The joint.
     stamps_s
         (n,) mid-exposure by the camera's stamps, seconds.
     places_px
@@ -105,11 +85,10 @@ def fit_offset(
         )
     places_px, rows = places_px[:, patches], rows[patches]
     state = np.array([_search(motion, stamps_s, places_px), 0.0, 0.0])
-    free = np.array([True, float(np.ptp(rows)) > 0.2, True])
-    problem = _Problem(motion, stamps_s, places_px, rows, free)
+    linearised = partial(_Equations, motion, stamps_s, places_px, rows)
     weights = np.isfinite(places_px).astype(np.float64)
     for step in range(MOST_STEPS):
-        equations = _Equations(problem, state, weights)
+        equations = linearised(state, weights)
         change = equations.step()
         state = state + change
         state[0] = np.clip(state[0], -1.5 * REACH_S, 1.5 * REACH_S)
@@ -119,8 +98,24 @@ def fit_offset(
             break
     else:
         raise CannotTell("the fit of the time offset does not settle; a longer or wider sweep is needed")
-    sigmas = _sigmas(problem, state, weights)
-    return _told(equations, state, sigmas)
+    if abs(state[0]) > REACH_S:
+        raise CannotTell(f"the stamps are further than {REACH_S:g} s off the joint readings")
+    leg, _ = motion.leg(stamps_s + state[0])
+    sigmas = _sigmas(linearised, leg, state, weights)
+    seen = equations.weights > 0
+    rolls = equations.free[1]
+    return OffsetFit(
+        offset_s=float(state[0]),
+        sigma_s=float(sigmas[0]),
+        rolling_s=float(state[1]) if rolls else None,
+        rolling_sigma_s=float(sigmas[1]) if rolls else None,
+        play_rad=float(2 * state[2]),
+        play_sigma_rad=float(2 * sigmas[2]),
+        frames=len(equations.frames),
+        patches=int(np.isfinite(equations.residuals_px).any(axis=0).sum()),
+        legs=len(equations.legs),
+        rms_px=float(np.sqrt(np.average(equations.residuals_px[seen] ** 2, weights=equations.weights[seen]))),
+    )
 
 
 def _search(motion: JointMotion, stamps_s: FloatArray, places_px: FloatArray) -> float:
@@ -167,17 +162,24 @@ def _unexplained(angles_rad: FloatArray, places_px: FloatArray) -> float:
 class _Equations:
     """The problem linearised at a state (o, c, h), each patch's cubic taken out of it."""
 
-    def __init__(self, problem: _Problem, state: FloatArray, weights: FloatArray) -> None:
-        motion, places_px = problem.motion, problem.places_px
-        self.free = problem.free
+    def __init__(
+        self,
+        motion: JointMotion,
+        stamps_s: FloatArray,
+        places_px: FloatArray,
+        rows: FloatArray,
+        state: FloatArray,
+        weights: FloatArray,
+    ) -> None:
+        self.free = np.array([True, float(np.ptp(rows)) > 0.2, True])  # of (o, c, h)
         self.residuals_px = np.full(places_px.shape, np.nan)
         self.weights = np.zeros(places_px.shape)
         self.normal = np.zeros((3, 3))
         self.right = np.zeros(3)
         self.legs: set[int] = set()
         self.frames: set[int] = set()
-        for patch, row in enumerate(problem.rows):
-            times_s = problem.stamps_s + state[0] + state[1] * row
+        for patch, row in enumerate(rows):
+            times_s = stamps_s + state[0] + state[1] * row
             leg, sign = motion.leg(times_s)
             seen = np.isfinite(places_px[:, patch]) & (leg >= 0) & (weights[:, patch] > 0)
             if seen.sum() < LEAST_FRAMES // 2:
@@ -187,12 +189,12 @@ class _Equations:
             span = max(float(np.ptp(angles_rad)), 1e-9)
             scaled = (angles_rad - angles_rad.mean()) * (2 / span)
             base = np.vander(scaled, 4)
-            held, triangle = np.linalg.qr(base * root[:, None])
-            cubic = np.linalg.solve(triangle, held.T @ (places_px[seen, patch] * root))
+            base_q, triangle = np.linalg.qr(base * root[:, None])
+            cubic = np.linalg.solve(triangle, base_q.T @ (places_px[seen, patch] * root))
             slope = np.vander(scaled, 3) @ (cubic[:3] * [3, 2, 1]) * (2 / span)
             speed = motion.slope(times_s[seen])
             ways = slope[:, None] * np.stack([speed, speed * row, -sign[seen]], axis=1) * root[:, None]
-            ways -= held @ (held.T @ ways)
+            ways -= base_q @ (base_q.T @ ways)
             residual = places_px[seen, patch] - base @ cubic
             self.residuals_px[seen, patch] = residual
             self.weights[seen, patch] = weights[seen, patch]
@@ -233,35 +235,20 @@ class _Equations:
         return np.where(np.isfinite(sizes), np.maximum(weights, 1e-6), 1e-3)
 
 
-def _sigmas(problem: _Problem, state: FloatArray, weights: FloatArray) -> FloatArray:
+def _sigmas(
+    linearised: Callable[[FloatArray, FloatArray], _Equations],
+    leg: NDArray[np.int64],
+    state: FloatArray,
+    weights: FloatArray,
+) -> FloatArray:
     """One sigma of the state, (3,), by leaving out each way of the head in turn (the jackknife).
 
     Errors within one way go together: a reading's stamp, the phase of its counts, the play's side.
     """
-    leg, _ = problem.motion.leg(problem.stamps_s + state[0])
     changes = []
     for number in np.unique(leg[leg >= 0]):
         rest = np.where((leg == number)[:, None], 0.0, weights)
-        changes.append(_Equations(problem, state, rest).step())
+        changes.append(linearised(state, rest).step())
     spread = np.array(changes) - np.mean(changes, axis=0)
     sigmas: FloatArray = np.sqrt((len(changes) - 1) / len(changes) * np.sum(spread**2, axis=0))
     return sigmas
-
-
-def _told(equations: _Equations, state: FloatArray, sigmas: FloatArray) -> OffsetFit:
-    if abs(state[0]) > REACH_S:
-        raise CannotTell(f"the stamps are further than {REACH_S:g} s off the joint readings")
-    seen = equations.weights > 0
-    weights, residuals_px = equations.weights[seen], equations.residuals_px[seen]
-    return OffsetFit(
-        offset_s=float(state[0]),
-        sigma_s=float(sigmas[0]),
-        rolling_s=float(state[1]) if equations.free[1] else None,
-        rolling_sigma_s=float(sigmas[1]) if equations.free[1] else None,
-        play_rad=float(2 * state[2]),
-        play_sigma_rad=float(2 * sigmas[2]),
-        frames=len(equations.frames),
-        patches=int(np.isfinite(equations.residuals_px).any(axis=0).sum()),
-        legs=len(equations.legs),
-        rms_px=float(np.sqrt(np.average(residuals_px**2, weights=weights))),
-    )

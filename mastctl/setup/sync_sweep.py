@@ -1,6 +1,6 @@
-"""Turns the head to and fro, and takes what the cameras and the joints tell meanwhile.
+"""Turns the head to and fro, and records frames and joint readings meanwhile.
 
-The cameras are asked directly, not through the service's checks: stamps that cannot be true are what this is
+The cameras are called directly, not through the service's checks: stamps that cannot be true are what this is
 to find out. The head goes through `mastctl.devices.devices`, so that limits and stop are the service's own.
 """
 
@@ -25,11 +25,7 @@ from mastctl.errors import MastctlError, Stopped
 from mastctl.setup.sync_fit import REACH_S, OffsetFit, fit_offset
 from mastctl.setup.sync_motion import CannotTell, JointMotion, Patches, choose_patches
 
-SPEEDS = (
-    1.0,
-    0.4,
-    0.7,
-)  # parts of the chosen speed, way after way: an odd number, so that each goes both ways
+SPEEDS = (1.0, 0.4, 0.7)  # parts of the chosen speed, an odd number, so that each goes both ways
 USUAL_AMPLITUDE_RAD = 0.07
 MOST_OF_VIEW = 0.15  # of the narrowest camera's view, to either side
 USUAL_SPEED = 5.0  # amplitudes a second
@@ -82,7 +78,7 @@ def plan_sweep(
     speed_rad_per_s: float | None,
     seconds: float,
 ) -> SweepPlan:
-    """Return a sweep that the cameras' views allow, as far as it was not asked for otherwise."""
+    """Return a sweep that the cameras' views allow, as far as it was not requested otherwise."""
     if amplitude_rad is None:
         narrowest = min(_view_rad(rig, name) for name in cameras)
         amplitude_rad = min(USUAL_AMPLITUDE_RAD, MOST_OF_VIEW * narrowest)
@@ -100,20 +96,10 @@ def _view_rad(rig: Rig, camera: str) -> float:
 
 
 class Sweep:
-    """One measurement: go, and take everything down.
+    """One measurement by the head of ``devices`` and open cameras on it, by name.
 
-    Parameters
-    ----------
-    devices
-        The head; cameras are not asked through it.
-    cameras
-        Open cameras on the head, by name.
-    rig, limits
-        The mast file's content and the soft limits.
-    stop
-        Set from anywhere it ends the sweep: the head is halted where it is.
-    clock
-        What readings and frames are stamped with, and what the sweep waits on.
+    ``stop``, set from anywhere, ends it: the head is halted where it is. ``clock`` stamps readings and
+    frames.
     """
 
     def __init__(
@@ -132,22 +118,20 @@ class Sweep:
         self._stop = stop
         self._clock = clock
         self._over = threading.Event()
-        self._ended = clock.signal()
-        self._watching = 0  # cameras whose thread is at work
         self._readings: list[Reading] = []
         self.seen = {name: Sightings() for name in cameras}
 
     def run(self, plan: SweepPlan) -> None:
-        """Sweep, and bring the head back to where it stood.
+        """Sweep, and bring the head back to its start.
 
         Raises
         ------
         Stopped
-            If it was stopped; the head stands where that was.
+            If it was stopped; the head is at rest there.
         OutsideLimits, KeptOut
             Before anything moves, if the sweep would pass a limit or a keep-out.
         DriverError
-            If the head fails; it is halted. A camera that fails is only told of (`seen`).
+            If the head fails; it is halted. The failure of a camera is in `seen`.
         """
         self._rest()
         start = self._devices.read()
@@ -157,14 +141,12 @@ class Sweep:
             self._devices.judge.check_move(goal, lambda: start)
         self._limits.speed(plan.speed_rad_per_s)
         threads = [
-            self._clock.thread(partial(self._watch, name, start, plan), f"sweep {name}")
+            self._clock.thread(partial(self._follow, name, start, plan), f"sweep {name}")
             for name in self._cameras
         ]
+        for thread in threads:
+            thread.start()
         try:
-            for thread in threads:
-                thread.start()
-                with self._ended:  # it may have ended already: then this makes up for what it took off
-                    self._watching += 1
             self._wait_for_choices()
             if self._to_and_fro(start, plan):
                 self._go(start.pan_rad, start.tilt_rad, plan.speed_rad_per_s)
@@ -174,9 +156,8 @@ class Sweep:
         finally:
             self._over.set()
             end_s = self._clock.now_s() + END_S
-            with self._ended:
-                while self._watching > 0 and (left_s := end_s - self._clock.now_s()) > 0:
-                    self._ended.wait(left_s)
+            while any(thread.is_alive() for thread in threads) and self._clock.now_s() < end_s:
+                self._clock.sleep(READ_EVERY_S)
 
     def fit(self, camera: str) -> OffsetFit:
         """Return a camera's offset to the joint readings. Raises CannotTell."""
@@ -184,7 +165,7 @@ class Sweep:
         if seen.failure and not seen.stamps_s:
             raise CannotTell(seen.failure)
         if seen.patches is None or not seen.stamps_s:
-            raise CannotTell("it gave no picture while the head turned")
+            raise CannotTell("it gave no image while the head turned")
         seen.check_clock()
         motion = JointMotion(
             np.array([reading.time_s for reading in self._readings]),
@@ -197,10 +178,10 @@ class Sweep:
 
     def _check_stop(self) -> None:
         if self._stop.is_set():
-            raise Stopped("it was stopped; the head stands where that was")
+            raise Stopped("it was stopped; the head is at rest there")
 
     def _note(self) -> Reading:
-        """Take the newest reading down."""
+        """Record the newest reading."""
         reading = self._devices.last_reading
         if reading is None:
             reading = self._devices.read()
@@ -214,7 +195,7 @@ class Sweep:
         self._check_stop()
 
     def _rest(self) -> None:
-        """Wait until the head has stood still for long enough."""
+        """Wait until the head has been at rest for long enough."""
         since_s = self._clock.now_s()
         until_s = since_s + ARRIVE_S
         while self._clock.now_s() - since_s < REST_S:
@@ -245,7 +226,7 @@ class Sweep:
         return ways
 
     def _go(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float) -> None:
-        """Go there, and take readings down until the head stands."""
+        """Go there, and record readings until the head is at rest."""
         self._check_stop()
         self._devices.move(pan_rad, tilt_rad, speed_rad_per_s)
         sent_s = self._clock.now_s()
@@ -258,22 +239,13 @@ class Sweep:
             self._pause()
 
     def _choose(self, name: str, start: Reading, plan: SweepPlan) -> Patches:
-        """Take a camera's picture at rest and choose what to follow in it."""
+        """Take a camera's image at rest and choose what to follow in it."""
         frame = self._cameras[name].next_frame(self._clock.now_s(), FRAME_TIMEOUT_S)
         joints_rad = self._rig.joints.true_rad((start.pan_rad, start.tilt_rad))
         return choose_patches(frame.image, self._rig, name, joints_rad, plan.amplitude_rad)
 
-    def _watch(self, name: str, start: Reading, plan: SweepPlan) -> None:
-        """In a thread of its own: follow one camera, and say when that has ended."""
-        try:
-            self._follow(name, start, plan)
-        finally:
-            with self._ended:
-                self._watching -= 1
-                self._ended.notify_all()
-
     def _follow(self, name: str, start: Reading, plan: SweepPlan) -> None:
-        """Choose patches of a picture at rest, and find them in what comes."""
+        """In a thread of its own: choose patches of an image at rest, and find them in what comes."""
         seen, camera = self.seen[name], self._cameras[name]
         try:
             patches = self._choose(name, start, plan)

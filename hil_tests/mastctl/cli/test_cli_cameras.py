@@ -27,12 +27,12 @@ def test_another_reader_finds_the_words_and_the_picture() -> None:
 
 def test_the_quality_of_a_picture_is_plain_arithmetic() -> None:
     quality = quality_of(PICTURE)
-    assert quality.mean == pytest.approx(PICTURE.mean())
-    assert quality.median == pytest.approx(np.median(PICTURE), abs=1)
-    assert quality.saturated_share == pytest.approx((PICTURE >= 250).mean())
-    assert quality.dark_share == pytest.approx((PICTURE <= 5).mean())
+    assert quality["mean"] == pytest.approx(PICTURE.mean())
+    assert quality["median"] == pytest.approx(np.median(PICTURE), abs=1)
+    assert quality["saturated_share"] == pytest.approx((PICTURE >= 250).mean())
+    assert quality["dark_share"] == pytest.approx((PICTURE <= 5).mean())
     counts, _ = np.histogram(PICTURE, bins=16, range=(0, 256))
-    assert quality.histogram == pytest.approx(counts / PICTURE.size)
+    assert quality["histogram"] == pytest.approx(counts / PICTURE.size)
     assert sharpness(PICTURE) > 10 * sharpness(np.asarray(cv2.GaussianBlur(PICTURE, (9, 9), 3)))
 
 

@@ -76,7 +76,7 @@ def test_a_camera_that_keeps_its_promises_has_no_problem() -> None:
     ("wrong", "words"),
     [
         ("old", "was exposed 0.300 s before the requested moment"),
-        ("old", "asked for a frame exposed in 60 s, within 0.2 s, it gave one that was exposed before"),
+        ("old", "requested a frame exposed in 60 s, within 0.2 s: one came that was exposed before"),
         ("count", "count and time must grow together"),
         ("future", "stamped to end 0.200 s in the future"),
         ("size", "the image is 32x48 px where the mast file has 64x48 px"),
