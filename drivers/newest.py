@@ -112,154 +112,6 @@ class Counters:
 Arrived = TypeVar("Arrived", bound=Kept)
 
 
-class Newest(Generic[Arrived]):
-    """Holds one frame; safe from any thread."""
-
-    def __init__(self) -> None:
-        self._changed = threading.Condition(threading.Lock())
-        self._frame: Arrived | None = None
-        self._make: Callable[[], tuple[Image, bytes]] | None = None
-        self._picture: tuple[Image, bytes] | None = None
-        self._recent: deque[Arrived] = deque(maxlen=RECENT_FRAMES)  # of this stream
-        self._counters = Counters()
-        self._lost = ""
-        self._closed = False
-
-    @property
-    def counters(self) -> Counters:
-        """The counts so far."""
-        with self._changed:
-            return replace(self._counters)
-
-    @property
-    def lost(self) -> str:
-        """Why there are no frames now; empty while there are."""
-        return self._lost
-
-    @property
-    def frame(self) -> Arrived | None:
-        """The newest good frame, however old; None if there is none."""
-        return self._frame
-
-    def instead(self, exposed_after_s: float, timeout_s: float, damaged_before: int, now_s: float) -> str:
-        """Return what to say when no fresh frame came, in one sentence."""
-        counters, last = self.counters, self.frame
-        message = f"no frame exposed after the requested moment came within {timeout_s:.3g} s"
-        if damaged := counters.damaged - damaged_before:
-            message += f"; {damaged} came damaged ({counters.last_damage})"
-        if last is None:
-            return message if damaged else f"{message}; none came at all"
-        age_s = exposed_after_s - last.window.begin_s
-        if age_s < 0.0:  # late enough, but older than a frame that is still to come
-            age_s = now_s - last.window.begin_s
-            return f"{message}; the last good one is frame {last.sequence}, {age_s:.3f} s old"
-        return f"{message}; the last good one is frame {last.sequence}, exposed {age_s:.3f} s before"
-
-    def recent(self) -> list[Arrived]:
-        """Return the last good frames of this stream, oldest first."""
-        with self._changed:
-            return list(self._recent)
-
-    def take(
-        self, exposed_after_s: float, timeout_s: float, is_young: Callable[[Arrived], bool]
-    ) -> tuple[Arrived, Image, bytes] | None:
-        """Return the newest frame, once its exposure began after that moment, and its read-only picture, with
-        the JPEG that it was made of (empty where the camera gives none).
-
-        A frame that was there before is given only while it ``is_young``. None after ``timeout_s``, and at
-        once when the camera is lost or closed.
-        """
-        until_s = time.monotonic() + timeout_s
-        with self._changed:
-            first = self._frame
-            while True:
-                newest = self._frame
-                if (
-                    newest is not None
-                    and newest.window.begin_s > exposed_after_s + ROUNDING_S
-                    and (newest is not first or is_young(newest))
-                    and (picture := self._converted()) is not None
-                ):
-                    return newest, *picture
-                left_s = until_s - time.monotonic()
-                if self._closed or self._lost or left_s <= 0:
-                    return None
-                self._changed.wait(left_s)
-
-    def wait_until(self, holds: Callable[[], bool], timeout_s: float) -> None:
-        """Wait until a frame came with which something ``holds``, or none will come, for so long at most."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._closed or bool(self._lost) or holds(), timeout_s)
-
-    def _converted(self) -> tuple[Image, bytes] | None:
-        """The newest frame's picture; None if making it finds it damaged.
-
-        It is made under the lock: the frame's buffer does not go back meanwhile.
-        """
-        if self._picture is None and self._make is not None:
-            try:
-                self._picture = self._make()
-                self._picture[0].setflags(write=False)
-            except BadFrame as error:
-                self._frame = None
-                self._counters.good -= 1
-                self._counters.damaged += 1
-                self._counters.last_damage = str(error)
-        return self._picture
-
-    # Called by the thread that captures
-
-    def publish(
-        self, frame: Arrived, make: Callable[[], tuple[Image, bytes]], *, dropped: int, late: bool
-    ) -> None:
-        """Put a good frame in the place of the last one, whose memory may be filled again."""
-        with self._changed:
-            self._counters.dropped += dropped
-            self._counters.good += 1
-            self._counters.late += late
-            self._frame, self._make, self._picture = frame, make, None
-            self._recent.append(frame)
-            self._changed.notify_all()
-
-    def refuse(self, dropped: int, wrong: str = "") -> None:
-        """Count a frame that is not published; ``wrong`` says why it is damaged, if it is."""
-        with self._changed:
-            self._counters.dropped += dropped
-            if wrong:
-                self._counters.damaged += 1
-                self._counters.last_damage = wrong
-
-    def lose(self, why: str) -> bool:
-        """Say that there are no frames for now, and forget the last one; return whether there were any."""
-        with self._changed:
-            had, self._lost = not self._lost, why
-            self._forget()
-            self._changed.notify_all()
-        return had
-
-    def forget(self) -> None:
-        """Forget the last frame: what it lies in goes away."""
-        with self._changed:
-            self._forget()
-
-    def come_back(self) -> None:
-        """Say that the camera was opened again."""
-        with self._changed:
-            self._lost = ""
-            self._counters.reopened += 1
-
-    def close(self) -> bool:
-        """End every call that waits; return whether it was open."""
-        with self._changed:
-            was_open, self._closed = not self._closed, True
-            self._changed.notify_all()
-        return was_open
-
-    def _forget(self) -> None:
-        self._frame = self._make = self._picture = None
-        self._recent.clear()
-
-
 class CapturedCamera(Camera, Generic[Arrived]):
     """A camera with a thread of its own, which takes frames until closed, and opens it again when it fails.
 
@@ -272,7 +124,14 @@ class CapturedCamera(Camera, Generic[Arrived]):
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.newest: Newest[Arrived] = Newest()
+        self._changed = threading.Condition(threading.Lock())  # guards what follows
+        self._newest: Arrived | None = None
+        self._make: Callable[[], tuple[Image, bytes]] | None = None
+        self._picture: tuple[Image, bytes] | None = None
+        self._recent: deque[Arrived] = deque(maxlen=RECENT_FRAMES)  # of this stream
+        self._counters = Counters()
+        self._lost = ""
+        self._closed = False
         self._over = threading.Event()
         self._opening = threading.Lock()  # guards what is adjusted, and which values are in force
         self._in_force: Mapping[str, ValuesSet] = {}  # of the stream that was opened last
@@ -303,12 +162,18 @@ class CapturedCamera(Camera, Generic[Arrived]):
     @property
     def lost(self) -> str:
         """Why there are no frames now: the camera is gone or its stream failed; empty while it streams."""
-        return self.newest.lost
+        return self._lost
+
+    @property
+    def newest(self) -> Arrived | None:
+        """The newest good frame, however old; None if there is none."""
+        return self._newest
 
     @property
     def counters(self) -> Counters:
         """The counts of good, damaged and missing frames so far."""
-        return self.newest.counters
+        with self._changed:
+            return replace(self._counters)
 
     def next_frame(self, exposed_after_s: float, timeout_s: float) -> TimedFrame:
         """Return the newest frame whose exposure surely began after ``exposed_after_s``, waiting if need be.
@@ -317,16 +182,68 @@ class CapturedCamera(Camera, Generic[Arrived]):
         came within ``timeout_s`` seconds; the message says what came instead; NoCamera (at once, if the
         camera is gone).
         """
-        damaged = self.newest.counters.damaged
-        taken = self.newest.take(exposed_after_s, timeout_s, self._is_young)
+        damaged = self._counters.damaged
+        taken = self._fresh(exposed_after_s, timeout_s)
         if taken is None:
-            if lost := self.newest.lost:
-                raise NoCamera(lost)
-            message = self.newest.instead(exposed_after_s, timeout_s, damaged, self.now_s())
-            raise NoFreshFrame(message, device=self.name)
+            if self._lost:
+                raise NoCamera(self._lost)
+            raise NoFreshFrame(self._instead(exposed_after_s, timeout_s, damaged), device=self.name)
         if self._last is None or self._last.image is not taken[1]:
             self._last = self._timed(*taken)
         return self._last
+
+    def _fresh(self, exposed_after_s: float, timeout_s: float) -> tuple[Arrived, Image, bytes] | None:
+        """The newest frame, once its exposure began after that moment, its read-only picture, and its JPEG.
+
+        A frame that was there before is given only while it is young. None after ``timeout_s``, and at once
+        when the camera is lost or closed.
+        """
+        until_s = time.monotonic() + timeout_s
+        with self._changed:
+            first = self._newest
+            while True:
+                newest = self._newest
+                if (
+                    newest is not None
+                    and newest.window.begin_s > exposed_after_s + ROUNDING_S
+                    and (newest is not first or self._is_young(newest))
+                    and (picture := self._converted()) is not None
+                ):
+                    return newest, *picture
+                left_s = until_s - time.monotonic()
+                if self._closed or self._lost or left_s <= 0:
+                    return None
+                self._changed.wait(left_s)
+
+    def _converted(self) -> tuple[Image, bytes] | None:
+        """The newest frame's picture; None if making it finds it damaged.
+
+        It is made under the lock: the frame's buffer does not go back meanwhile.
+        """
+        if self._picture is None and self._make is not None:
+            try:
+                self._picture = self._make()
+                self._picture[0].setflags(write=False)
+            except BadFrame as error:
+                self._newest = None
+                self._counters.good -= 1
+                self._counters.damaged += 1
+                self._counters.last_damage = str(error)
+        return self._picture
+
+    def _instead(self, exposed_after_s: float, timeout_s: float, damaged_before: int) -> str:
+        """What to say when no fresh frame came, in one sentence."""
+        counters, last = self.counters, self._newest
+        message = f"no frame exposed after the requested moment came within {timeout_s:.3g} s"
+        if damaged := counters.damaged - damaged_before:
+            message += f"; {damaged} came damaged ({counters.last_damage})"
+        if last is None:
+            return message if damaged else f"{message}; none came at all"
+        age_s = exposed_after_s - last.window.begin_s
+        if age_s < 0.0:  # late enough, but older than a frame that is still to come
+            age_s = self.now_s() - last.window.begin_s
+            return f"{message}; the last good one is frame {last.sequence}, {age_s:.3f} s old"
+        return f"{message}; the last good one is frame {last.sequence}, exposed {age_s:.3f} s before"
 
     def now_s(self) -> float:
         """Return the time by the clock of its stamps."""
@@ -334,15 +251,23 @@ class CapturedCamera(Camera, Generic[Arrived]):
 
     def recent_times(self) -> list[FrameTime]:
         """Return the times of the last good frames of this stream, oldest first."""
-        return [FrameTime(frame.sequence, frame.window.begin_s) for frame in self.newest.recent()]
+        with self._changed:
+            return [FrameTime(frame.sequence, frame.window.begin_s) for frame in self._recent]
 
     def await_settled(self, timeout_s: float) -> None:
         """Wait until a frame came that shows no setting of before, or none will, for so long at most."""
-        self.newest.wait_until(lambda: all(one.settled for one in self._in_force.values()), timeout_s)
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._closed or self._lost or all(one.settled for one in self._in_force.values()),
+                timeout_s,
+            )
 
     def close(self) -> None:
         """End the thread and let go of the camera; one that hangs is left behind after 2 s."""
-        if not self.newest.close():
+        with self._changed:
+            was_closed, self._closed = self._closed, True
+            self._changed.notify_all()
+        if was_closed:
             return
         self._over.set()
         if self._thread is not None:
@@ -369,7 +294,8 @@ class CapturedCamera(Camera, Generic[Arrived]):
                     log.exception("%s: the capture failed", self.name)
                     self._lose(f"{self.name}: the capture failed: {type(error).__name__}: {error}")
                 finally:
-                    self.newest.forget()
+                    with self._changed:
+                        self._forget()  # what the frame lies in goes away
                     self._let_go(stream)
             if self._over.wait(self._pause_s):
                 return
@@ -377,9 +303,37 @@ class CapturedCamera(Camera, Generic[Arrived]):
             stream = self._reopened()
 
     def _lose(self, why: str) -> None:
-        """Note that there are no frames for now."""
-        if self.newest.lose(why):
+        """Note that there are no frames for now, and forget the last one."""
+        with self._changed:
+            had, self._lost = not self._lost, why
+            self._forget()
+            self._changed.notify_all()
+        if had:
             log.warning("%s; it is opened again when it is back", why)
+
+    def _forget(self) -> None:
+        self._newest = self._make = self._picture = None
+        self._recent.clear()
+
+    def _publish(
+        self, frame: Arrived, make: Callable[[], tuple[Image, bytes]], *, dropped: int, late: bool
+    ) -> None:
+        """Put a good frame in the place of the last one, whose memory may be filled again."""
+        with self._changed:
+            self._counters.dropped += dropped
+            self._counters.good += 1
+            self._counters.late += late
+            self._newest, self._make, self._picture = frame, make, None
+            self._recent.append(frame)
+            self._changed.notify_all()
+
+    def _refuse(self, dropped: int, wrong: str = "") -> None:
+        """Count a frame that is not published; ``wrong`` says why it is damaged, if it is."""
+        with self._changed:
+            self._counters.dropped += dropped
+            if wrong:
+                self._counters.damaged += 1
+                self._counters.last_damage = wrong
 
     def _reopened(self) -> Any:
         """Try to open the camera again; None if it is not back."""
@@ -390,8 +344,10 @@ class CapturedCamera(Camera, Generic[Arrived]):
                 self._pause_s = self.gone_pause_s or self._pause_s
             elif not isinstance(error, DriverError):  # a defect: the thread goes on trying, and says so
                 log.exception("%s: opening again failed", self.name)
-            self.newest.lose(str(error) or type(error).__name__)
+            self._lose(str(error) or type(error).__name__)
             return None
-        self.newest.come_back()
+        with self._changed:
+            self._lost = ""
+            self._counters.reopened += 1
         log.warning("%s is back", self.name)
         return stream

@@ -168,8 +168,8 @@ class AravisCamera(CapturedCamera[ArrivedGenicam]):
     def _there(self) -> Device:
         """The camera that streams. Raises NoCamera if it is gone."""
         device = self._device
-        if device is None or self.newest.lost:
-            raise NoCamera(self.newest.lost or f"{self.name}: it is being opened again")
+        if device is None or self.lost:
+            raise NoCamera(self.lost or f"{self.name}: it is being opened again")
         return device
 
     def _allow(self, exposure_s: float) -> None:
@@ -252,7 +252,7 @@ class AravisCamera(CapturedCamera[ArrivedGenicam]):
         self._learned += not wrong
         learning = not self._clock.readings and self._learned <= LEARNING_FRAMES
         if wrong or learning:
-            self.newest.refuse(dropped, wrong)
+            self._refuse(dropped, wrong)
             device.queue(filled.handle)
             return
         window = self._window(filled, self._longest_s)
@@ -265,7 +265,7 @@ class AravisCamera(CapturedCamera[ArrivedGenicam]):
         if sent_s := filled.sent.get(EXPOSURE.name):
             window = self._window(filled, sent_s)
         frame = ArrivedGenicam(filled, window, settings, self._last_sequence, self._streams, received_s)
-        self.newest.publish(frame, partial(self._made, device, filled.handle), dropped=dropped, late=False)
+        self._publish(frame, partial(self._made, device, filled.handle), dropped=dropped, late=False)
         previous, self._kept_buffer = self._kept_buffer, filled.handle
         if previous is not None:
             device.queue(previous)

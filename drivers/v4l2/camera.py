@@ -304,7 +304,7 @@ class V4l2Camera(CapturedCamera[Arrived]):
             timing = Timing(*reported[EXPOSURE.name], *self._spacing.see(sequence, buffer.stamp_s))
             window = exposure_window(stream.rule, timing, buffer.flags, buffer.stamp_s, received_s)
         if window is None:
-            self.newest.refuse(dropped, wrong)
+            self._refuse(dropped, wrong)
             stream.node.queue(buffer.number)
             return
         settings = {name: value for name, (value, _) in reported.items()}
@@ -312,7 +312,7 @@ class V4l2Camera(CapturedCamera[Arrived]):
             buffer, stream.format, timing, window, sequence, self._streams, received_s, settings
         )
         late = received_s - buffer.stamp_s > stream.period_s + LATE_S
-        self.newest.publish(arrived, partial(self._made, stream.node, arrived), dropped=dropped, late=late)
+        self._publish(arrived, partial(self._made, stream.node, arrived), dropped=dropped, late=late)
         previous, self._kept_buffer = self._kept_buffer, buffer.number
         if previous is not None:
             stream.node.queue(previous)

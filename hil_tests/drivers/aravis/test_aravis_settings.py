@@ -150,10 +150,10 @@ def test_a_camera_that_is_opened_again_has_the_values_of_the_run_time(device: Gi
     camera = opened(features={"Focus": 40})
     camera.adjust({"exposure_s": 0.009, "gain": 7.0, "focus": 55.0})
     device.unplug()
-    until(lambda: camera.newest.lost, "the loss")
+    until(lambda: camera.lost, "the loss")
     again = GigeCamera(ADDRESS, more=True)
     try:
-        until(lambda: not camera.newest.lost, "the return")
+        until(lambda: not camera.lost, "the return")
         frame = taken(camera, again)
     finally:
         again.unplug()

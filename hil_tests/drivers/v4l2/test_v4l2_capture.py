@@ -292,7 +292,7 @@ def test_a_closed_camera_gives_no_frame_though_one_had_come(bench: Bench, camera
     camera.close()
     with pytest.raises(NoFreshFrame):
         camera.next_frame(0.0, 0.0)
-    assert camera.newest.frame is None and not camera.newest.recent()  # their memory is unmapped
+    assert camera.newest is None and not camera.recent_times()  # their memory is unmapped
 
 
 def test_the_count_grows_when_the_drivers_count_begins_again(bench: Bench, camera: V4l2Camera) -> None:

@@ -32,7 +32,7 @@ def test_a_frame_has_a_changed_setting_once_it_surely_shows(
 
         def told(exposure_s: float = 0.036) -> dict[str, float | None]:
             seen.arrive(sensor.shoot(PERIOD_S, exposure_s))
-            newest = camera.newest.frame
+            newest = camera.newest
             return {} if newest is None else dict(newest.settings)
 
         for _ in range(SETTLE_FRAMES + 1):
