@@ -159,9 +159,9 @@ def _board(args: argparse.Namespace, paper_mm: tuple[float, float]) -> AnyBoard:
     """The board of the options and the paper, read as its file will be."""
     from calib.errors import BadFile
     from calib.targets.board_file import board_of, dictionary_size
-    from mastctl.setup.board_sheet import room_mm
+    from mastctl.setup.board_sheet import largest_mm
 
-    wide_mm, high_mm = room_mm(paper_mm)
+    wide_mm, high_mm = largest_mm(paper_mm)
     usual_mm = USUAL_MM * min(wide_mm, high_mm) / 174.0
     usual_mm = max(1.0, float(round(usual_mm / 5.0) * 5.0 if usual_mm > 10 else round(usual_mm)))
     document: dict[str, Any] = {"kind": args.kind}
@@ -254,7 +254,7 @@ def _check_free(yaml: Path, measured: bool) -> None:
 
 def _written(yaml: Path, files: list[Path], bar_m: tuple[float, float]) -> Answer:
     from calib.targets.board_file import document_of, load_board
-    from mastctl.setup.board_sheet import drawn
+    from mastctl.setup.board_sheet import description
 
     board = load_board(yaml)
     document = {
@@ -264,5 +264,8 @@ def _written(yaml: Path, files: list[Path], bar_m: tuple[float, float]) -> Answe
         "size_m": list(board.size_m),
     }
     width_mm, height_mm = (1000 * size for size in board.size_m)
-    lines = [f"{drawn(board)}; {width_mm:.1f} x {height_mm:.1f} mm", *(f"written: {one}" for one in files)]
+    lines = [
+        f"{description(board)}; {width_mm:.1f} x {height_mm:.1f} mm",
+        *(f"written: {one}" for one in files),
+    ]
     return Answer(document, lines)

@@ -63,7 +63,7 @@ def _new(args: argparse.Namespace) -> Answer:
     """Query, ask, write, and return the next commands."""
     from drivers.servo_bus.bench import ServosOnLine
     from mastctl.rig.folder import check_free, write_rig, write_simulated
-    from mastctl.rig.plugged import look
+    from mastctl.rig.plugged import find_plugged
     from mastctl.rig.questions import Prompts
     from mastctl.setup.machine import ExaminedMachine
 
@@ -71,8 +71,8 @@ def _new(args: argparse.Namespace) -> Answer:
     check_free(args.folder)
     machine = ExaminedMachine()
     questions = Prompts(terminal=False if args.json else None)
-    found = look(args.port, machine, output.tell)
-    for line in (*(f"found {one}" for one in found.words), *found.unused):
+    found = find_plugged(args.port, machine, output.tell)
+    for line in (*(f"found {one}" for one in found.summaries), *found.unused):
         output.tell(line)
     head = _head(found, questions)
     if args.port and head is None:

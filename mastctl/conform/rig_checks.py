@@ -233,7 +233,7 @@ def _stopped_on_the_way(trial: RigTrial, goal: Angles) -> str:
     name = trial.start(goal)
     until_s = time.monotonic() + BEGINS_WITHIN_S
     while True:
-        asked_s = time.monotonic()
+        requested_s = time.monotonic()
         status = trial.status()
         if status.get("moving"):
             break
@@ -243,7 +243,7 @@ def _stopped_on_the_way(trial: RigTrial, goal: Angles) -> str:
     sent_s = time.monotonic()
     expect(trial.client.stop().get("stopped") is True, "POST /stop does not answer that it stopped")
     answered_s = time.monotonic()
-    took_s = answered_s - asked_s + number(status, "joints", "age_s")
+    took_s = answered_s - requested_s + number(status, "joints", "age_s")
     status = trial.rest(BRAKED_WITHIN_S)
     record = trial.ended(name)
     rests_rad = _away(trial.joints(status), goal)
@@ -254,8 +254,8 @@ def _stopped_on_the_way(trial: RigTrial, goal: Angles) -> str:
         f"stopped {left_rad:.3f} rad before its goal the head went on ({took_s:.2f} s from that reading)",
     )
     expect(record["state"] == "stopped", f"the operation that was stopped ended {record['state']!r}")
-    word = trial.status().get("state")
-    expect(word == "holding", f"after the stop the state is {word!r}, not holding")
+    state = trial.status().get("state")
+    expect(state == "holding", f"after the stop the state is {state!r}, not holding")
     trial.let_pass(10 * POLL_S)
     crept_rad = abs(_away(trial.joints(), goal) - rests_rad)
     expect(crept_rad <= ARRIVED_RAD, f"after the stop the head crept by {crept_rad:.4f} rad")

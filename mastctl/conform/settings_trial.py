@@ -21,21 +21,9 @@ def settings_tried(
 ) -> str:
     """Try each setting that may be changed now but focus, and return their names.
 
-    A focus is left alone: its motor may not come back to the calibrated place.
-
-    Parameters
-    ----------
-    read, adjust
-        Return the settings, and change one; as `drivers.interfaces.Camera.adjust`.
-    of_a_frame
-        Returns the settings of a frame that is exposed from now on.
-
-    Raises
-    ------
-    PromiseBroken
-        If a setting is not as it was set, a frame has another, or it does not come back.
-    NotTried
-        If there is none to try.
+    A focus is left alone: its motor may not come back to the calibrated place. ``read`` and ``adjust`` are as
+    in `drivers.interfaces.Camera`; ``of_a_frame`` returns the settings of a frame exposed from now on. Raises
+    PromiseBroken, and NotTried if there is none to try.
     """
     tried = []
     for one in read():

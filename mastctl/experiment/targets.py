@@ -58,20 +58,11 @@ def choose_target(
     distance_m: float,
     rng: np.random.Generator,
 ) -> Target | None:
-    """Return a random textured pixel of the left picture at the distance, or None if a few tries find none.
+    """Return a random textured pixel of the left image at the distance, or None if a few tries find none.
 
-    The choice looks at the two pictures before the move only, so it cannot favour targets that land well.
-
-    Parameters
-    ----------
-    left, right
-        Pictures of one stereo pair with the head at rest.
-    left_in_rover, right_in_rover
-        The camera models at the pictures' joint angles, rover frame.
-    distance_m
-        Wanted range from the left camera, metres; kept to within 12 %.
-    rng
-        Chooses.
+    ``left`` and ``right`` are of one stereo pair with the head at rest, their camera models at that moment in
+    the rover frame; the range from the left camera is within 12 % of ``distance_m``. The choice uses the two
+    images before the move only, so it cannot favour targets that land well.
     """
     candidates = texture_mask(left.image)
     likely = candidates & on_level_ground(left_in_rover, distance_m)
@@ -145,70 +136,55 @@ OPERATION_TIMEOUT_S = 60.0
 STOP_TIMEOUT_S = 30.0
 
 
+@dataclass(frozen=True)
 class TargetViews:
     """Views of one stereo pair on the head, at random azimuths within ``pan_range_rad`` of straight ahead."""
 
-    def __init__(
-        self,
-        client: Client,
-        rig: Rig,
-        pair: tuple[str, str],
-        limits: Mapping[str, Any],
-        rng: np.random.Generator,
-        pan_range_rad: float,
-    ) -> None:
-        self._client = client
-        self._rig = rig
-        self._pair = pair
-        self._pan_limits_rad = (float(limits["pan_rad"][0]), float(limits["pan_rad"][1]))
-        self._tilt_limits_rad = (float(limits["tilt_rad"][0]), float(limits["tilt_rad"][1]))
-        self._rng = rng
-        self._pan_range_rad = pan_range_rad
+    client: Client
+    rig: Rig
+    pair: tuple[str, str]
+    limits: Mapping[str, Any]
+    rng: np.random.Generator
+    pan_range_rad: float
 
     def find_target(self, distance_m: float) -> Target | None:
         """Turn to a random piece of ground at the distance and choose a pixel there, if it offers one.
 
-        Raises
-        ------
-        ClientError
-            If the daemon does not turn the head or gives no pictures.
+        Raises ClientError if the daemon does not turn the head or gives no images.
         """
         pair = self.look_at(self._ground_ahead(distance_m))
         if pair is None:
             return None
-        models = tuple(self._rig.camera_in_rover(shot.camera, *shot.true_rad) for shot in pair)
-        return choose_target(*pair, models[0], models[1], distance_m, self._rng)
+        models = tuple(self.rig.camera_in_rover(shot.camera, *shot.true_rad) for shot in pair)
+        return choose_target(*pair, models[0], models[1], distance_m, self.rng)
 
     def look_at(self, point_m: FloatArray) -> tuple[Snapshot, Snapshot] | None:
-        """Turn to a point (3,) of the rover frame and take both pictures; None outside the head's limits.
+        """Turn to a point (3,) of the rover frame and take both images; None outside the head's limits.
 
-        Raises
-        ------
-        ClientError
-            If the daemon does not turn the head or gives no pictures.
+        Raises ClientError if the daemon does not turn the head or gives no images.
         """
         try:
-            solutions = pointing.solve(self._rig.mast, self._rig.cameras[self._pair[0]].model, point_m)
-            joints = self._rig.joints
+            solutions = pointing.solve(self.rig.mast, self.rig.cameras[self.pair[0]].model, point_m)
+            joints = self.rig.joints
             angles = choose(
                 [Solution(*joints.read_rad((one.pan_rad, one.tilt_rad)), one.range_m) for one in solutions],
-                self._pan_limits_rad,
-                self._tilt_limits_rad,
+                tuple(self.limits["pan_rad"]),
+                tuple(self.limits["tilt_rad"]),
             )
         except Unreachable:
             return None
-        operation = pointed(self._client, pan_rad=angles.pan_rad, tilt_rad=angles.tilt_rad)
+        operation = pointed(self.client, pan_rad=angles.pan_rad, tilt_rad=angles.tilt_rad)
         if operation["state"] != "done":
             error = operation["error"] or {"code": operation["state"], "message": "the move was stopped"}
             raise ClientError(error["code"], error["message"])
-        return self._client.snapshot(self._pair[0]), self._client.snapshot(self._pair[1])
+        return self.client.snapshot(self.pair[0]), self.client.snapshot(self.pair[1])
 
     def _ground_ahead(self, distance_m: float) -> FloatArray:
         """A point (3,) of level ground at the range from the head, anywhere ahead, rover frame."""
-        head_in_rover_m = self._rig.mast.rover_from_head(0.0, 0.0).translation_m
+        head_in_rover_m = self.rig.mast.rover_from_head(0.0, 0.0).translation_m
         height_m = float(head_in_rover_m[2])
         along_m = math.sqrt(max(distance_m**2 - height_m**2, 0.0))
-        azimuth_rad = self._rng.uniform(-self._pan_range_rad, self._pan_range_rad)
+        azimuth_rad = self.rng.uniform(-self.pan_range_rad, self.pan_range_rad)
         return np.array(
             [
                 head_in_rover_m[0] + along_m * math.cos(azimuth_rad),
@@ -221,11 +197,8 @@ class TargetViews:
 def pointed(client: Client, **request: Any) -> OperationTold:
     """Have the daemon point as `Client.point` says; return the ended operation's record.
 
-    Raises
-    ------
-    ClientError
-        If it refuses; ``timeout``, if it has not ended in time. It is stopped then, so that the next one can
-        begin.
+    Raises ClientError if it refuses; ``timeout``, if it has not ended in time: it is stopped then, so that
+    the next one can begin.
     """
     operation = client.point(**request)
     try:

@@ -42,21 +42,10 @@ class _Broke(Exception):
 
 
 class Work(Generic[Task, Result]):
-    """Tasks of one function, whose result depends on a task's value alone.
+    """Tasks of one function of a module, whose result depends on a task's value alone.
 
-    Parameters
-    ----------
-    function
-        Of a module, so that another process finds it by its name.
-    tasks
-        Dataclasses of arrays, numbers, texts and such; the same value is the same task.
-    label
-        Describes a task.
-
-    Attributes
-    ----------
-    ids
-        Of the tasks, in their order: by function, version of the program, and value.
+    Tasks are dataclasses of arrays, numbers and texts; ``label`` describes one. Their ``ids`` are in the same
+    order, made of function, version of the program, and value: the same value is the same task.
     """
 
     def __init__(
@@ -75,14 +64,8 @@ class Work(Generic[Task, Result]):
     ) -> list[Result]:
         """Return the results in the order of the tasks.
 
-        Parameters
-        ----------
-        executor
-            Opens what runs them; not called where every result is kept already.
-        kept
-            Kept results need no run, and each that comes is kept at once.
-        done
-            Called with each task and result as they come, first those that were kept.
+        ``executor`` is not opened where every result is ``kept`` already. ``done`` is called with each task
+        and result as they come, first those that were kept.
 
         Raises
         ------
@@ -190,20 +173,10 @@ class NoExecutor(MastctlError):
 
 @contextmanager
 def open_executor(name: str, workers: int | None = None) -> Iterator[Executor]:
-    """Open an executor by name, and close it at the end.
+    """Open an executor by name, and close it at the end. Raises NoExecutor.
 
-    Parameters
-    ----------
-    name
-        ``local``, or ``dask:ADDRESS`` of a running scheduler (``dask:tcp://host:8786``), whose workers have
-        this package installed.
-    workers
-        Processes of a local executor; one for each processor by default.
-
-    Raises
-    ------
-    NoExecutor
-        If the name is another, Dask is not installed, or its scheduler does not answer.
+    ``local`` has so many ``workers`` (processes; by default one a processor); ``dask:ADDRESS`` is a running
+    scheduler (``dask:tcp://host:8786``), whose workers have this package installed.
     """
     if name == "local":
         # Started afresh: the threads of a progress bar run in this process, which a fork would copy half.

@@ -1,6 +1,6 @@
 """What a run leaves: self-contained HTML pages, and for programs tables as CSV and records as JSON.
 
-Templates beside this module hold the words and their order, Python the numbers: one look, light, dark and on
+Templates beside this module have the text and its order, Python the numbers: one look, light, dark and on
 paper. Everything that is put in is escaped; nothing refers to a file or an address outside the page.
 """
 
@@ -27,19 +27,14 @@ class Badge:
     kind: str = ""
 
 
-def page(template: str | Path, **told: Any) -> str:
-    """Return a whole page.
+def page(template: str | Path, **values: Any) -> str:
+    """Return a whole page from a file of ``templates``, or, by its path, one that builds on these.
 
-    Parameters
-    ----------
-    template
-        A file of the folder ``templates``; by its path, one from elsewhere that builds on these.
-    told
-        For the head ``title`` (words), ``badge`` (`Badge`) and ``facts`` (pairs of words); then all that the
-        template names itself.
+    Its head needs ``title``, ``badge`` (`Badge`) and ``facts`` (pairs of texts); the rest is the template's
+    own.
     """
     beside = None if isinstance(template, str) else template.parent
-    return _templates(beside).get_template(Path(template).name).render(**told)
+    return _templates(beside).get_template(Path(template).name).render(**values)
 
 
 def of_daemon(status: Mapping[str, Any]) -> tuple[Badge, list[tuple[str, str]]]:
@@ -52,7 +47,7 @@ def of_daemon(status: Mapping[str, Any]) -> tuple[Badge, list[tuple[str, str]]]:
 
 @cache
 def _templates(beside: Path | None) -> Environment:
-    """The templates, and those of another folder, strict about names that nobody gave."""
+    """The templates, and those of another folder, strict about unknown names."""
     own = PackageLoader("mastctl.report")
     return Environment(
         loader=own if beside is None else ChoiceLoader([FileSystemLoader(beside), own]),

@@ -21,23 +21,7 @@ MARGIN_RAD = 0.1
 
 @dataclass(frozen=True)
 class RigAnswers:
-    """What nobody can ask a rig itself.
-
-    Attributes
-    ----------
-    height_m
-        Of the axes over the ground.
-    baseline_m
-        Between two cameras.
-    view_deg
-        Across the picture.
-    pan_deg, tilt_deg
-        Ends of what the head may reach.
-    pan_id, tilt_id
-        Which servo turns which axis.
-    date
-        Of the drawing.
-    """
+    """What a rig cannot report itself; ``height_m`` is that of the axes over the ground."""
 
     height_m: float = 1.0
     baseline_m: float = 0.1

@@ -56,18 +56,9 @@ _USB = re.compile(rf"{_NUMBERED.pattern}|/dev/serial/by-.*")
 
 @dataclass(frozen=True)
 class NewRigFolder:
-    """What was written.
+    """The ``files`` that were written, the ``next`` commands, and ``notes`` that a person must know.
 
-    Attributes
-    ----------
-    folder, files
-        Where, and the names in it.
-    simulated
-        Whether it is the twin, since no head and no camera is plugged in.
-    next
-        The three commands.
-    notes
-        A sentence for each thing that a person must know of these files.
+    ``simulated``: it is the twin, since no head and no camera is plugged in.
     """
 
     folder: Path
@@ -89,22 +80,17 @@ def write_rig(
 ) -> NewRigFolder:
     """Write the files of a rig with a head, cameras or both, and read them as the daemon does.
 
-    Raises
-    ------
-    InTheWay
-        If there is a file of a rig already.
-    BadFile, BadOptions
-        If the answers make no rig, or the file system refuses.
+    Raises InTheWay, and BadFile or BadOptions if the answers make no rig.
     """
     check_free(folder)
     cameras = list(plugged.cameras)
     port = LINE if head is None or _NUMBERED.fullmatch(head.port) else head.port
     name = re.sub(r"\W+", "_", folder.resolve().name) or "rig"
     servos = head is None or isinstance(head, ServosOnLine)
-    words = f"{_CONFIG_WORDS}{_SERVO_WORDS if servos else _HEAD_WORDS}"
+    note = f"{_CONFIG_NOTE}{_SERVO_NOTE if servos else _HEAD_NOTE}"
     files = {
-        CONFIG: words.encode() + dump_mapping(configuration(head, cameras, answers, port)),
-        MAST: _MAST_WORDS.encode() + dump_mapping(drawing(name, cameras, answers)),
+        CONFIG: note.encode() + dump_mapping(configuration(head, cameras, answers, port)),
+        MAST: _MAST_NOTE.encode() + dump_mapping(drawing(name, cameras, answers)),
     }
     names = camera_names(len(cameras))
     known = [tuple(_usb_of(camera, machine)) for camera in cameras]
@@ -188,18 +174,18 @@ def _written(
     return NewRigFolder(folder, tuple(names), simulated, steps)
 
 
-_CONFIG_WORDS = """\
+_CONFIG_NOTE = """\
 # Written by `mastctl rig new`; every key: docs/reference/configuration.md. Angles are radians.
 """
-_SERVO_WORDS = """\
+_SERVO_NOTE = """\
 # Check before the first move: which servo turns which axis, its sign (sign: -1), and the limits.
 # `mastctl rig servo info PORT ID` shows its position: turn it by hand, with its torque off, and ask again.
 """
-_HEAD_WORDS = """\
+_HEAD_NOTE = """\
 # Check before the first move: the sign of each axis (pan positive to the right, tilt up), zero_rad, and the
 # limits. `pytest --pyargs mastctl.testing.drivers --rig FILE --motion --reach 0.1` turns the head a little.
 """
-_MAST_WORDS = """\
+_MAST_NOTE = """\
 # Drawn, not calibrated: `mastctl calibrate bench` replaces it. Lengths to 2 cm are enough (meters, z down).
 # C: the camera from the meeting point of the axes at pan and tilt zero.
 # H and V: the image's center, and the focal length in pixels.
@@ -238,8 +224,8 @@ def _rule(about: str, matches: Sequence[tuple[str, str]], name: str) -> list[str
     """One line of a rule, if there is something to know the device by."""
     if not matches:
         return []
-    told = "".join(f', {key}=="{value}"' for key, value in matches)
-    return [f'{about}{told}, SYMLINK+="{name}"']
+    keys = "".join(f', {key}=="{value}"' for key, value in matches)
+    return [f'{about}{keys}, SYMLINK+="{name}"']
 
 
 def _steps(folder: Path, head: ProbedHead | None, cameras: int) -> tuple[str, ...]:
@@ -260,9 +246,9 @@ def _steps(folder: Path, head: ProbedHead | None, cameras: int) -> tuple[str, ..
 
 def _readme(plugged: Plugged, steps: Sequence[str], notes: Sequence[str] = ()) -> str:
     """What was found, the next three commands, and what comes after them."""
-    found = [f"- {words}" for words in plugged.words]
-    found += [f"- not used: {words}" for words in plugged.unused]
-    found += [f"- {words}" for words in notes]
+    found = [f"- {one}" for one in plugged.summaries]
+    found += [f"- not used: {one}" for one in plugged.unused]
+    found += [f"- {note}" for note in notes]
     return "\n".join(
         [
             "# A rig of your own",

@@ -46,33 +46,26 @@ class Plugged:
     unused: tuple[str, ...] = ()
 
     @property
-    def words(self) -> list[str]:
+    def summaries(self) -> list[str]:
         """A sentence for each head and camera."""
         return [*(one.summary for one in self.heads), *(one.summary for one in self.cameras)]
 
 
-def look(
+def find_plugged(
     ports: Sequence[str],
     machine: ExaminedMachine,
     say: Callable[[str], None],
 ) -> Plugged:
-    """Ask every serial line and camera what it is.
+    """Query the given serial lines, or every USB adapter, and all cameras.
 
-    Parameters
-    ----------
-    ports
-        The lines to ask; none: every USB adapter of the machine.
-    machine
-        Where devices lie.
-    say
-        Told what is being asked; a line takes some seconds.
+    ``say`` gets what is being queried; a line takes some seconds.
     """
     heads: list[ProbedHead] = []
     unused: list[str] = []
     named = [port if "://" in port else str(Path(port).absolute()) for port in ports]
     for port in named or serial_lines(machine):
         say(f"asking {port}")
-        found, why = ask_line(port, machine)
+        found, why = query_line(port, machine)
         if found is None:
             unused.append(why)
         elif not found.usable:
@@ -81,13 +74,13 @@ def look(
             heads.append(found)
             unused += [sentence] if (sentence := lacking(found)) else []
     say("asking the cameras")
-    cameras, no_cameras = ask_cameras()
+    cameras, no_cameras = query_cameras()
     for one in cameras[MOST_CAMERAS:]:
         unused.append(f"{one.summary}: a head has {MOST_CAMERAS} cameras at most here; {BY_HAND}")
     return Plugged(tuple(heads), tuple(cameras[:MOST_CAMERAS]), (*unused, *no_cameras))
 
 
-def ask_line(port: str, machine: ExaminedMachine) -> tuple[ProbedHead | None, str]:
+def query_line(port: str, machine: ExaminedMachine) -> tuple[ProbedHead | None, str]:
     """Return what answers on a line, or None and why nothing does; a line in use is left alone."""
     path = port if "://" in port else str(machine.at(port))
     pseudo = os.path.realpath(path).startswith("/dev/pts/")  # both its ends are open in the program behind it
@@ -107,11 +100,11 @@ def ask_line(port: str, machine: ExaminedMachine) -> tuple[ProbedHead | None, st
 
 
 def head_probes() -> list[Callable[[str, str], tuple[ProbedHead | None, str]]]:
-    """Return what asks a line for the heads of each installed driver."""
+    """Return what queries a line for the heads of each installed driver."""
     return [driver.probe for driver in drivers_of("head").values() if driver.probe is not None]
 
 
-def ask_cameras() -> tuple[list[ProbedCamera], list[str]]:
+def query_cameras() -> tuple[list[ProbedCamera], list[str]]:
     """Return the cameras with a format that is read, and a sentence for each of the others."""
     cameras: list[ProbedCamera] = []
     others: list[str] = []

@@ -1,4 +1,4 @@
-"""A sheet of paper with a board on it, two bars to measure, and words that say what it is."""
+"""A sheet of paper with a board on it, two bars to measure, and text that says what it is."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ Rectangle = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
-class Words:
-    """A line of text: where its left end stands on the line (mm), how high, how it is turned."""
+class TextLine:
+    """A line of text: the left end of its baseline (mm), its height, and whether it is turned upwards."""
 
     x_mm: float
     y_mm: float
@@ -46,24 +46,14 @@ class Words:
 class Sheet:
     """What is printed, in millimetres from the paper's upper left corner, x right and y down.
 
-    Attributes
-    ----------
-    size_mm
-        Of the paper.
-    rectangles, ellipses
-        Black: (left, top, right, bottom); (x, y, half width, half height).
-    words
-        Lines of text.
-    board
-        The board, whose middle is at ``middle_mm``.
-    bar_m
-        Lengths of the bars across and down, metres.
+    Black are the rectangles (left, top, right, bottom) and ellipses (x, y, half width, half height).
+    ``bar_m`` are the lengths of the bars across and down, metres.
     """
 
     size_mm: tuple[float, float]
     rectangles: tuple[Rectangle, ...]
     ellipses: tuple[Rectangle, ...]
-    words: tuple[Words, ...]
+    lines: tuple[TextLine, ...]
     board: AnyBoard
     middle_mm: tuple[float, float]
     bar_m: tuple[float, float]
@@ -75,7 +65,7 @@ class TooLarge(MastctlError):
     code, exit_code = "too_large", 2
 
 
-def room_mm(paper_mm: tuple[float, float]) -> tuple[float, float]:
+def largest_mm(paper_mm: tuple[float, float]) -> tuple[float, float]:
     """Return how wide and high a board may be on a paper."""
     return (
         paper_mm[0] - 2 * MARGIN_MM - 2 * SIDE_MM - 2.0,
@@ -84,21 +74,19 @@ def room_mm(paper_mm: tuple[float, float]) -> tuple[float, float]:
 
 
 def sheet_of(board: AnyBoard, paper_mm: tuple[float, float], name: str) -> Sheet:
-    """Lay a board out on paper.
-
-    Raises
-    ------
-    TooLarge
-        If it does not fit: by how much, and how large it may be.
-    """
+    """Lay a board out on paper. Raises TooLarge if it does not fit, with what would."""
     width_mm, height_mm = (1000.0 * size for size in board.size_m)
-    wide_mm, high_mm = room_mm(paper_mm)
+    wide_mm, high_mm = largest_mm(paper_mm)
     if width_mm > wide_mm + 1e-6 or height_mm > high_mm + 1e-6:
+        key = {"charuco": "square", "checkerboard": "square", "aprilgrid": "tag", "dots": "spacing"}[
+            board.kind
+        ]
         part = min(wide_mm / width_mm, high_mm / height_mm)
+        fits_mm = math.floor(10_000.0 * part * getattr(board, f"{key}_m")) / 10
         raise TooLarge(
             f"the board is {width_mm:.0f} x {height_mm:.0f} mm, and paper of "
-            f"{paper_mm[0]:g} x {paper_mm[1]:g} mm"
-            f" has room for {wide_mm:.0f} x {high_mm:.0f} mm; {part_told(board, part)}"
+            f"{paper_mm[0]:g} x {paper_mm[1]:g} mm has room for {wide_mm:.0f} x {high_mm:.0f} mm; "
+            f"--{key}-mm {fits_mm:g} would fit, or fewer columns and rows, or --landscape"
         )
     left, top = (paper_mm[0] - width_mm) / 2, MARGIN_MM + (high_mm + GAP_MM - height_mm) / 2
     middle = left + width_mm / 2, top + height_mm / 2
@@ -107,40 +95,35 @@ def sheet_of(board: AnyBoard, paper_mm: tuple[float, float], name: str) -> Sheet
     foot = top + height_mm + GAP_MM
     side = left - SIDE_MM
     bars = [*_bar(left, foot, across_mm, False), *_bar(side, top, down_mm, True)]
-    words = [
-        Words(left + across_mm / 2 - 22.0, foot - 1.2, SMALL_MM, f"{across_mm:g} mm across: measure it"),
-        Words(side - 1.2, top + down_mm / 2 + 20.0, SMALL_MM, f"{down_mm:g} mm down: measure it", True),
-        Words(left, foot + 6.0, TEXT_MM, drawn(board)),
-        Words(
-            left,
-            foot + 10.5,
-            SMALL_MM,
-            f"mastctl board {name}    this side up, x to the right, y down, z into the paper",
-        ),
-        Words(
-            left,
-            foot + 14.5,
+    texts = (
+        (6.0, TEXT_MM, description(board)),
+        (10.5, SMALL_MM, f"mastctl board {name}    this side up, x to the right, y down, z into the paper"),
+        (
+            14.5,
             SMALL_MM,
             f"Print at 100 % (no fit to page), glue flat. Write the bars' lengths into {name}.yaml:",
         ),
-        Words(
-            left, foot + 18.5, SMALL_MM, f"mastctl board measured {name}.yaml --across-mm ... --down-mm ..."
-        ),
+        (18.5, SMALL_MM, f"mastctl board measured {name}.yaml --across-mm ... --down-mm ..."),
+    )
+    lines = [
+        TextLine(left + across_mm / 2 - 22.0, foot - 1.2, SMALL_MM, f"{across_mm:g} mm across: measure it"),
+        TextLine(side - 1.2, top + down_mm / 2 + 20.0, SMALL_MM, f"{down_mm:g} mm down: measure it", True),
+        *(TextLine(left, foot + below_mm, height_mm, text) for below_mm, height_mm, text in texts),
     ]
     bars += _up(left + width_mm - 3.0, foot + 4.0)
     return Sheet(
         paper_mm,
         tuple(rectangles + bars),
         tuple(ellipses),
-        tuple(words),
+        tuple(lines),
         board,
         middle,
         (across_mm / 1000, down_mm / 1000),
     )
 
 
-def drawn(board: AnyBoard) -> str:
-    """Return what a board is, in one line for people."""
+def description(board: AnyBoard) -> str:
+    """Return the kind and measures of a board, in one line."""
     match board:
         case Charuco():
             old = ", drawn as before OpenCV 4.6" if board.legacy else ""
@@ -162,13 +145,6 @@ def drawn(board: AnyBoard) -> str:
             )
         case Checkerboard():
             return f"Chessboard, {board.columns} x {board.rows} squares of {_mm(board.square_m)} mm"
-
-
-def part_told(board: AnyBoard, part: float) -> str:
-    """Return how large what is drawn may be at so large a part of what was wanted."""
-    key = {"charuco": "square", "checkerboard": "square", "aprilgrid": "tag", "dots": "spacing"}[board.kind]
-    size_mm = math.floor(10_000.0 * part * getattr(board, f"{key}_m")) / 10
-    return f"--{key}-mm {size_mm:g} would fit, or fewer columns and rows, or --landscape"
 
 
 def _printed(board: AnyBoard, middle: tuple[float, float]) -> tuple[list[Rectangle], list[Rectangle]]:
@@ -228,7 +204,7 @@ def svg_of(sheet: Sheet) -> bytes:
     spots = "\n".join(
         f'<ellipse cx="{_n(x)}" cy="{_n(y)}" rx="{_n(rx)}" ry="{_n(ry)}"/>' for x, y, rx, ry in sheet.ellipses
     )
-    lines = "\n".join(_svg_words(one) for one in sheet.words)
+    lines = "\n".join(_svg_text(one) for one in sheet.lines)
     paper = f'width="{_n(width)}mm" height="{_n(height)}mm" viewBox="0 0 {_n(width)} {_n(height)}"'
     text = f"""<?xml version="1.0" encoding="UTF-8"?>
 <svg xmlns="http://www.w3.org/2000/svg" {paper}>
@@ -253,7 +229,7 @@ def pdf_of(sheet: Sheet) -> bytes:
         content.append("f")
     for ellipse in sheet.ellipses:
         content += _pdf_ellipse(*ellipse)
-    content += [_pdf_words(one) for one in sheet.words]
+    content += [_pdf_text(one) for one in sheet.lines]
     stream = zlib.compress("\n".join(content).encode("cp1252", "replace"), 9)
     objects = [
         b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",
@@ -287,16 +263,16 @@ def _pdf_ellipse(x: float, y: float, rx: float, ry: float) -> list[str]:
     return [*lines, "f"]
 
 
-def _pdf_words(words: Words) -> str:
-    text = words.text.replace("\\", "\\\\").replace("(", "\\(").replace(")", "\\)")
-    turn = "0 -1 -1 0" if words.upwards else "1 0 0 -1"
-    return f"BT /F1 {_n(words.height_mm)} Tf {turn} {_n(words.x_mm)} {_n(words.y_mm)} Tm ({text}) Tj ET"
+def _pdf_text(line: TextLine) -> str:
+    text = line.text.replace("\\", "\\\\").replace("(", "\\(").replace(")", "\\)")
+    turn = "0 -1 -1 0" if line.upwards else "1 0 0 -1"
+    return f"BT /F1 {_n(line.height_mm)} Tf {turn} {_n(line.x_mm)} {_n(line.y_mm)} Tm ({text}) Tj ET"
 
 
-def _svg_words(words: Words) -> str:
-    x, y = _n(words.x_mm), _n(words.y_mm)
-    turn = f' transform="rotate(-90 {x} {y})"' if words.upwards else ""
-    return f'<text x="{x}" y="{y}" font-size="{_n(words.height_mm)}"{turn}>{escape(words.text)}</text>'
+def _svg_text(line: TextLine) -> str:
+    x, y = _n(line.x_mm), _n(line.y_mm)
+    turn = f' transform="rotate(-90 {x} {y})"' if line.upwards else ""
+    return f'<text x="{x}" y="{y}" font-size="{_n(line.height_mm)}"{turn}>{escape(line.text)}</text>'
 
 
 def _n(value: float) -> str:

@@ -32,23 +32,15 @@ from mastctl.setup.machine import (
 from mastctl.watch.reference import SENTINEL_FOLDER
 from mastctl.watch.sentinel import read_folder, standing
 
-Asked = Callable[[str], Mapping[str, Any] | None]
-"""Returns the status of the daemon at an address, None if nobody answers there."""
-
 
 def examine(
-    path: str | None, asked: Asked, machine: ExaminedMachine | None = None
+    path: str | None,
+    status_at: Callable[[str], Mapping[str, Any] | None],
+    machine: ExaminedMachine | None = None,
 ) -> Iterator[DoctorFinding]:
-    """Look at everything that a configuration needs; nothing is opened that could move.
+    """Examine all that a configuration (None: the packaged one) needs; nothing that could move is opened.
 
-    Parameters
-    ----------
-    path
-        The configuration; None for the packaged one.
-    asked
-        Asks a daemon that may run already.
-    machine
-        Where devices and their descriptions lie; this machine by default.
+    ``status_at`` returns the status of the daemon at an address, None without an answer.
     """
     machine = machine or ExaminedMachine()
     try:
@@ -62,17 +54,15 @@ def examine(
         return
     yield DoctorFinding("configuration", "good", str(config.path))
     yield from examine_mast_file(config)
-    status = asked(config.listen.url)
+    status = status_at(config.listen.url)
     yield from _daemon(config, status)
     yield from _head_line(config, machine)
     yield from examine_drivers(installed_drivers())
     for name, camera in config.hardware.cameras.items():
         yield from examine_camera(name, camera, in_use=status is not None)
     yield from _simulation(config)
-    yield from examine_folder(
-        "state folder", config.state_folder or usual_folder(config.path, config.listen.url)
-    )
     state_folder = config.state_folder or usual_folder(config.path, config.listen.url)
+    yield from examine_folder("state folder", state_folder)
     yield from _sentinel(state_folder / SENTINEL_FOLDER)
     yield examine_kept()
     yield examine_clock()
@@ -90,13 +80,13 @@ def next_command(config: str | None, found: Sequence[DoctorFinding]) -> str:
 
 
 def _sentinel(folder: Path) -> Iterator[DoctorFinding]:
-    """What the drift sentinel's looks say, where it keeps them in the state folder."""
-    reference, looks, wrong = read_folder(folder)
+    """The drift sentinel's verdict, where it keeps its measurements in the state folder."""
+    reference, measurements, wrong = read_folder(folder)
     if wrong:
         yield DoctorFinding("drift", "unsure", wrong, "take a new reference: mastctl rig sentinel reference")
     if reference is None:
         return
-    now = standing(reference, looks, datetime.now(UTC))
+    now = standing(reference, measurements, datetime.now(UTC))
     good = now["level"] == "good"
     advice = "" if good else "repeat mastctl rig sentinel look; if it stays, calibrate again"
     level: Level = "good" if good else "unsure"  # the daemon works all the same
@@ -116,19 +106,19 @@ def _daemon(config: Config, status: Mapping[str, Any] | None) -> Iterator[Doctor
     yield from _calibration(status.get("calibration"))
 
 
-def _calibration(told: Mapping[str, Any] | None) -> Iterator[DoctorFinding]:
+def _calibration(calibration: Mapping[str, Any] | None) -> Iterator[DoctorFinding]:
     """Whether the mast file still holds."""
-    if told is None:
+    if calibration is None:
         return
-    what, sentence = "calibration", f"{told['sentence']} ({told['pointings']} pointings)"
-    if told["verdict"] == "drifts":
-        yield DoctorFinding(
-            what, "unsure", told["sentence"], "calibrate again; docs/how-to/drift.md says where to look"
-        )
-    elif told["verdict"] == "unknown":
-        yield DoctorFinding(what, "unsure", sentence, "calibrate again: mastctl calibrate writes it")
-    else:
-        yield DoctorFinding(what, "good", sentence)
+    sentence, verdict = calibration["sentence"], calibration["verdict"]
+    if verdict == "drifts":
+        advice = "calibrate again; docs/how-to/drift.md says where to look"
+        yield DoctorFinding("calibration", "unsure", sentence, advice)
+        return
+    sentence = f"{sentence} ({calibration['pointings']} pointings)"
+    unknown = verdict == "unknown"
+    advice = "calibrate again: mastctl calibrate writes it" if unknown else ""
+    yield DoctorFinding("calibration", "unsure" if unknown else "good", sentence, advice)
 
 
 def _head_line(config: Config, machine: ExaminedMachine) -> Iterator[DoctorFinding]:
@@ -149,12 +139,12 @@ def _head_line(config: Config, machine: ExaminedMachine) -> Iterator[DoctorFindi
         yield from examine_port(port, machine)
         yield from _head_options(head, driver, port)
     else:
-        words = f"driver {head.driver} has no 'port' in its options"
-        yield DoctorFinding("port", "bad", words, "name the serial device; docs/reference/configuration.md")
+        message = f"driver {head.driver} has no 'port' in its options"
+        yield DoctorFinding("port", "bad", message, "name the serial device; docs/reference/configuration.md")
 
 
 def _head_options(head: DeviceSettings, driver: Driver, port: str) -> Iterator[DoctorFinding]:
-    """Whether the driver takes the head's options, and what queries such a head; it is not queried here."""
+    """Whether the driver takes the head's options, and what queries such a head; it is not queried."""
     assert driver.read_options is not None
     try:
         read = driver.read_options(head.options)
@@ -162,17 +152,17 @@ def _head_options(head: DeviceSettings, driver: Driver, port: str) -> Iterator[D
         advice = "correct the configuration; docs/how-to/hardware.md has every option"
         yield DoctorFinding("head", "bad", str(error), advice)
         return
-    words = f"driver {head.driver}, {read.baud} baud"
+    message = f"driver {head.driver}, {read.baud} baud"
     if isinstance(driver.bench, UnitBench):
-        words += f"; 'mastctl rig ptu info {quote(read.port)} --baud {read.baud}' queries it"
-    yield DoctorFinding("head", "good", words)
+        message += f"; 'mastctl rig ptu info {quote(read.port)} --baud {read.baud}' queries it"
+    yield DoctorFinding("head", "good", message)
     if not isinstance(driver.bench, ServoBench):
         return
     ids, line = (read.pan.servo_id, read.tilt.servo_id), line_words(port, head.driver)
-    words = f"pan is servo {ids[0]} and tilt servo {ids[1]}; 'mastctl rig servo scan {line}' lists them"
+    message = f"pan is servo {ids[0]} and tilt servo {ids[1]}; 'mastctl rig servo scan {line}' lists them"
     new = next((number for number in ids if number != 1), 2)
     advice = f"a new servo has the id 1: connect it alone, then mastctl rig servo set-id {line} 1 {new}"
-    yield DoctorFinding("servos", "good", words, advice)
+    yield DoctorFinding("servos", "good", message, advice)
 
 
 def _simulation(config: Config) -> Iterator[DoctorFinding]:
@@ -188,8 +178,8 @@ def _simulation(config: Config) -> Iterator[DoctorFinding]:
     except BadOptions as error:
         yield DoctorFinding("simulation", "bad", str(error), "correct the configuration")
     except ImportError:
-        words = "numba is not installed, which renders what simulated cameras see"
-        yield DoctorFinding("simulation", "bad", words, "pip install 'mastctl[sim]'")
+        message = "numba is not installed, which renders what simulated cameras see"
+        yield DoctorFinding("simulation", "bad", message, "pip install 'mastctl[sim]'")
     else:
         yield DoctorFinding("simulation", "good", f"a simulated rover, rendered by numba {numba.__version__}")
 
@@ -197,26 +187,24 @@ def _simulation(config: Config) -> Iterator[DoctorFinding]:
 def examine_camera(name: str, camera: DeviceSettings, *, in_use: bool) -> Iterator[DoctorFinding]:
     """Examine one camera; no stream is begun. ``in_use``: whether a daemon that runs may have it."""
     what = f"camera {name}"
+    level: Level = "bad"
     try:
         bench = driver_of("camera", camera.driver, name).bench
         if bench is not None:
             yield DoctorFinding(what, "good", bench.present(camera.options, name))
+        return
     except BadOptions as error:
-        yield DoctorFinding(what, "bad", str(error), "correct the configuration")
+        message, advice = str(error), "correct the configuration"
     except NoPermission as error:
-        yield DoctorFinding(what, "bad", str(error))  # it names the group, and how to join it
-    except (NoCamera, CameraBusy) as error:
-        busy = isinstance(error, CameraBusy)
-        remedy = (
-            "end the program that has it"
-            if busy
-            else "plug it in; mastctl camera list shows what is connected"
-        )
-        yield DoctorFinding(
-            what, "good" if busy and in_use else "bad", str(error), "" if busy and in_use else remedy
-        )
+        message, advice = str(error), ""  # it names the group, and how to join it
+    except CameraBusy as error:
+        message, advice = str(error), "" if in_use else "end the program that has it"
+        level = "good" if in_use else "bad"
+    except NoCamera as error:
+        message, advice = str(error), "plug it in; mastctl camera list shows what is connected"
     except DriverError as error:
-        yield DoctorFinding(what, "bad", str(error), "mastctl camera check says more")
+        message, advice = str(error), "mastctl camera check says more"
+    yield DoctorFinding(what, level, message, advice)
 
 
 OLD_DAYS = 180
@@ -225,7 +213,7 @@ OLD_DAYS = 180
 def examine_mast_file(
     config: Config, now: Callable[[], datetime] = lambda: datetime.now(UTC)
 ) -> Iterator[DoctorFinding]:
-    """Look at the mast file of a configuration."""
+    """Examine the mast file of a configuration."""
     try:
         stored = load_rig(config.mast_file)
         check_cameras(config, stored.rig)
@@ -244,31 +232,30 @@ def _age(provenance: Mapping[str, Any], now: datetime) -> DoctorFinding:
     what, advice = "mast file's age", "calibrate again: mastctl calibrate"
     try:
         made = datetime.fromisoformat(str(provenance.get("date", "")))
-        made = made if made.tzinfo else made.replace(tzinfo=UTC)
     except ValueError:
         return DoctorFinding(what, "unsure", "it does not say when it was made", advice)
-    days = (now - made).days
+    days = (now - (made if made.tzinfo else made.replace(tzinfo=UTC))).days
+    sentence = f"made on {made:%Y-%m-%d}, {days} days ago"
     if days < 0:
-        return DoctorFinding(
-            what,
-            "unsure",
-            f"it was made on {made:%Y-%m-%d}, in the future",
-            "look at this machine's clock, or at the one that made it",
-        )
-    told = f"made on {made:%Y-%m-%d}, {days} days ago"
-    if days > OLD_DAYS:
-        return DoctorFinding(what, "unsure", told, f"look whether residuals have grown, or {advice}")
-    return DoctorFinding(what, "good", told)
+        sentence = f"it was made on {made:%Y-%m-%d}, in the future"
+        advice = "check this machine's clock, or that of the machine that made it"
+    elif days > OLD_DAYS:
+        advice = f"check whether residuals have grown, or {advice}"
+    else:
+        return DoctorFinding(what, "good", sentence)
+    return DoctorFinding(what, "unsure", sentence, advice)
 
 
 def _verdict(fit: Mapping[str, Any]) -> DoctorFinding:
     what = "calibration's verdict"
     verdict = fit.get("verdict")
-    words = verdict.get("words") if isinstance(verdict, Mapping) else None
-    if not isinstance(words, str):
+    sentence = verdict.get("words") if isinstance(verdict, Mapping) else None
+    if not isinstance(sentence, str):
         return DoctorFinding(
             what, "unsure", "it does not say how well it fits", "calibrate with mastctl calibrate"
         )
     levels: dict[object, Level] = {"good": "good", "bad": "bad"}
     level = levels.get(verdict.get("grade") if isinstance(verdict, Mapping) else None, "unsure")
-    return DoctorFinding(what, level, words, "" if level == "good" else "the calibration's report says why")
+    return DoctorFinding(
+        what, level, sentence, "" if level == "good" else "the calibration's report says why"
+    )

@@ -24,18 +24,9 @@ Level = Literal["good", "unsure", "bad"]
 
 @dataclass(frozen=True)
 class DoctorFinding:
-    """One thing that was examined.
+    """One thing that was examined: ``what``, in two or three words, and ``advice`` if it is not good.
 
-    Attributes
-    ----------
-    what
-        What it is about, in two or three words.
-    level
-        ``good``; ``unsure``: works, but not as well or not for sure; ``bad``: the daemon will not work.
-    sentence
-        What was found.
-    advice
-        What a person does about it; empty where it is good.
+    ``unsure``: it works, but not as well or not for sure; ``bad``: the daemon will not work.
     """
 
     what: str
@@ -55,7 +46,7 @@ class ExaminedMachine:
         return self.root / str(path).lstrip("/")
 
     def text(self, path: str | Path) -> str | None:
-        """Return a small file's words, None if it cannot be read."""
+        """Return a small file's text, None if it cannot be read."""
         try:
             return self.at(path).read_text().strip()
         except (OSError, ValueError):
@@ -83,9 +74,9 @@ class _Timex(ctypes.Structure):
 
 
 def clock_status() -> int | None:
-    """Return the kernel's status bits of the wall clock, None if it does not tell."""
-    told = _Timex()
-    return None if ctypes.CDLL(None).adjtimex(ctypes.byref(told)) < 0 else told.status
+    """Return the kernel's status bits of the wall clock, None if it is not known."""
+    state = _Timex()
+    return None if ctypes.CDLL(None).adjtimex(ctypes.byref(state)) < 0 else state.status
 
 
 def examine_clock(
@@ -94,33 +85,33 @@ def examine_clock(
     """Look at the wall clock, which dates records, logs and mast files; motion does not depend on it."""
     now = datetime.fromtimestamp(now_s(), UTC)
     if now < BUILT:
-        words = f"the clock says {now:%Y-%m-%d}, which is past"
-        return DoctorFinding("clock", "bad", words, "set it: records and mast files are dated by it")
+        message = f"the clock says {now:%Y-%m-%d}, which is past"
+        return DoctorFinding("clock", "bad", message, "set it: records and mast files are dated by it")
     bits = status()
     if bits is None or bits & _NOT_SYNCHRONISED:
-        words = f"the clock says {now:%Y-%m-%d %H:%M} UTC and follows no time server"
-        return DoctorFinding("clock", "unsure", words, "install chrony or switch systemd-timesyncd on")
+        message = f"the clock says {now:%Y-%m-%d %H:%M} UTC and follows no time server"
+        return DoctorFinding("clock", "unsure", message, "install chrony or switch systemd-timesyncd on")
     return DoctorFinding("clock", "good", f"{now:%Y-%m-%d %H:%M} UTC, kept by a time server")
 
 
 def examine_folder(what: str, folder: Path) -> Iterator[DoctorFinding]:
     """Look whether a folder, or the one that it would be made in, may be written and has room."""
-    there = next(one for one in (folder, *folder.parents) if one.exists())
-    if not there.is_dir():
-        yield DoctorFinding(what, "bad", f"{there} is no folder", "name another, or move it away")
+    present = next(one for one in (folder, *folder.parents) if one.exists())
+    if not present.is_dir():
+        yield DoctorFinding(what, "bad", f"{present} is no folder", "name another, or move it away")
         return
-    if not os.access(there, os.W_OK | os.X_OK):
-        words = f"{there} may not be written by this user"
-        yield DoctorFinding(what, "bad", words, f'sudo chown "$USER" {there}, or name another folder')
+    if not os.access(present, os.W_OK | os.X_OK):
+        message = f"{present} may not be written by this user"
+        yield DoctorFinding(what, "bad", message, f'sudo chown "$USER" {present}, or name another folder')
         return
-    free = shutil.disk_usage(there).free
-    told = f"{folder}: {free / 1e9:.1f} GB free"
+    free = shutil.disk_usage(present).free
+    sentence = f"{folder}: {free / 1e9:.1f} GB free"
     if free < LEAST_FREE_BYTES:
         yield DoctorFinding(
-            what, "unsure", told, "make room: what happened before a fault may not be recorded"
+            what, "unsure", sentence, "make room: what happened before a fault may not be recorded"
         )
     else:
-        yield DoctorFinding(what, "good", told)
+        yield DoctorFinding(what, "good", sentence)
 
 
 def examine_drivers(installed: Sequence[InstalledDriver]) -> Iterator[DoctorFinding]:
@@ -129,15 +120,15 @@ def examine_drivers(installed: Sequence[InstalledDriver]) -> Iterator[DoctorFind
     others = [one for one in installed if one.distribution != OURS]
     names = [(one.kind, one.name) for one in others]
     for one in others:
-        what, told = f"driver {one.name}", f"for a {one.kind}: {one.path} of {one.package}"
+        what, sentence = f"driver {one.name}", f"for a {one.kind}: {one.path} of {one.package}"
         if (one.kind, one.name) in own:
-            words = f"{told}; mastctl's own driver of this name is used instead"
-            yield DoctorFinding(what, "unsure", words, f"name it {one.path} in the configuration")
+            message = f"{sentence}; mastctl's own driver of this name is used instead"
+            yield DoctorFinding(what, "unsure", message, f"name it {one.path} in the configuration")
         elif names.count((one.kind, one.name)) > 1:
-            words = f"{told}; another package offers one of this name"
-            yield DoctorFinding(what, "unsure", words, "uninstall one of them, or name the factory itself")
+            message = f"{sentence}; another package offers one of this name"
+            yield DoctorFinding(what, "unsure", message, "uninstall one of them, or name the factory itself")
         else:
-            yield DoctorFinding(what, "good", told)
+            yield DoctorFinding(what, "good", sentence)
 
 
 def examine_kept() -> DoctorFinding:
@@ -145,20 +136,23 @@ def examine_kept() -> DoctorFinding:
     sizes = {kind: kept_bytes(kind) for kind in MOST_BYTES}
     kinds = ", ".join(f"{kind} {size / 1e6:.0f}" for kind, size in sizes.items())
     most = sum(MOST_BYTES.values())
-    told = f"{kept_home()}: {sum(sizes.values()) / 1e6:.0f} MB ({kinds}) of at most {most / 1e6:.0f} MB"
-    return DoctorFinding("kept", "good", told)
+    sentence = f"{kept_home()}: {sum(sizes.values()) / 1e6:.0f} MB ({kinds}) of at most {most / 1e6:.0f} MB"
+    return DoctorFinding("kept", "good", sentence)
 
 
 def examine_descriptors() -> DoctorFinding:
     """Look how many files, sockets and devices a process of this user may have open."""
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    told = f"{most} files and connections at once"
+    sentence = f"{most} files and connections at once"
     if most != resource.RLIM_INFINITY and most < LEAST_DESCRIPTORS:
         return DoctorFinding(
-            "descriptors", "unsure", told, f"ulimit -n {LEAST_DESCRIPTORS} or more, LimitNOFILE= of the unit"
+            "descriptors",
+            "unsure",
+            sentence,
+            f"ulimit -n {LEAST_DESCRIPTORS} or more, LimitNOFILE= of the unit",
         )
     return DoctorFinding(
-        "descriptors", "good", told if most != resource.RLIM_INFINITY else "as many as there are"
+        "descriptors", "good", sentence if most != resource.RLIM_INFINITY else "as many as there are"
     )
 
 
@@ -175,10 +169,10 @@ def serial_lines(machine: ExaminedMachine) -> list[str]:
 
 
 def examine_port(port: str, machine: ExaminedMachine) -> Iterator[DoctorFinding]:
-    """Look at the port of a head without opening it: whoever opens a line may move what hangs on it."""
+    """Look at the port of a head without opening it: opening a line may move what is connected to it."""
     if "://" in port:
         yield DoctorFinding(
-            "port", "unsure", f"{port} is on the network; it is not asked here", "try mastctl run"
+            "port", "unsure", f"{port} is on the network; it is not queried here", "try mastctl run"
         )
         return
     path = machine.at(port)
@@ -204,16 +198,16 @@ def _permission(port: str, path: Path) -> Iterator[DoctorFinding]:
         return
     about = path.stat()
     group = _group(about.st_gid)
-    words = f"{port} may not be opened by this user; it is of group {group}, {stat.filemode(about.st_mode)}"
+    message = f"{port} may not be opened by this user; it is of group {group}, {stat.filemode(about.st_mode)}"
     if about.st_gid == 0 or about.st_mode & 0o060 != 0o060:
         advice = (
             "install the udev rules (docs/how-to/hardware.md), which give it to dialout; for now: "
             f"sudo chgrp dialout {port} && sudo chmod g+rw {port}"
         )
-        yield DoctorFinding("port permission", "bad", words, advice)
+        yield DoctorFinding("port permission", "bad", message, advice)
         return
     yield DoctorFinding(
-        "port permission", "bad", words, f'sudo usermod -aG {group} "$USER", then log in again'
+        "port permission", "bad", message, f'sudo usermod -aG {group} "$USER", then log in again'
     )
 
 
@@ -224,10 +218,10 @@ def _holder(port: str, path: Path, machine: ExaminedMachine) -> Iterator[DoctorF
         if process.name == str(os.getpid()):
             continue
         try:
-            held = any(Path(os.path.realpath(one)) == real for one in (process / "fd").iterdir())
+            in_use = any(Path(os.path.realpath(one)) == real for one in (process / "fd").iterdir())
         except OSError:  # of another user, or gone
             continue
-        if held:
+        if in_use:
             name = machine.text(f"/proc/{process.name}/comm") or "a program"
             yield DoctorFinding(
                 "port in use",

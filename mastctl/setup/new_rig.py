@@ -37,25 +37,10 @@ class BadRig(MastctlError):
 
 @dataclass(frozen=True)
 class RigNumbers:
-    """What a new rig is made of.
+    """What a new rig is made of; its axes meet ``height_m`` over the ground, over the rover's origin.
 
-    Attributes
-    ----------
-    height_m
-        Of the pan and tilt axes over the ground; they meet over the rover's origin. 0.3 to 5.
-    baseline_m
-        Between the two cameras, 0.02 to 1.
-    focal_px
-        Focal length; the view along the longer side, 2 atan(side / 2 / focal_px), is 1 to 110 degrees.
-    size_px
-        (width, height), 64 to 4096 each.
-    name
-        Of the rig.
-
-    Raises
-    ------
-    BadRig
-        With the option of ``mastctl rig sim new`` that is out of bounds.
+    ``focal_px`` has to see 1 to 110 degrees along the longer side: 2 atan(side / 2 / focal_px). Raises BadRig
+    with the option of ``mastctl rig sim new`` that is out of bounds.
     """
 
     height_m: float = 1.5
@@ -73,8 +58,8 @@ class RigNumbers:
                 raise BadRig(f"{option} is {value:g} m where {low:g} to {high:g} m are expected")
         for side in self.size_px:
             if not 64 <= side <= 4096:
-                told = "x".join(str(one) for one in self.size_px)
-                raise BadRig(f"--size is {told} where 64 to 4096 pixels a side are expected")
+                size = "x".join(map(str, self.size_px))
+                raise BadRig(f"--size is {size} where 64 to 4096 pixels a side are expected")
         longest_px = max(self.size_px)
         view_rad = 2.0 * math.atan(longest_px / 2.0 / self.focal_px)
         if not math.radians(1.0) <= view_rad <= WIDEST_RAD:

@@ -61,13 +61,7 @@ def boards_about(count: int) -> list[dict[str, float]]:
 
 
 def check_empty(folder: Path, force: bool) -> None:
-    """Refuse a folder that holds files of a rig, unless they may be replaced.
-
-    Raises
-    ------
-    InTheWay
-        Naming the first of them.
-    """
+    """Refuse a folder that holds files of a rig, unless they may be replaced. Raises InTheWay."""
     for name in (CONFIG, MAST, TRUE_RIG):
         if (folder / name).exists() and not force:
             raise InTheWay(f"{folder / name} exists; another folder, or --force to replace it, is expected")
@@ -102,14 +96,7 @@ def write_built(
 def write_twin(file: Path, folder: Path, simulation: Mapping[str, Any], seed: int) -> NewRig:
     """Write a mast file, to the byte, and a true rig that it could be the calibration of.
 
-    Raises
-    ------
-    BadFile
-        If the mast file is none, or something cannot be written.
-    BadRig, CalibError
-        If no true rig can be drawn: see `true_twin`.
-    BadOptions
-        If ``simulation`` is none.
+    Raises BadFile, BadOptions for ``simulation``, and as `true_twin` if no true rig can be drawn.
     """
     believed = load_rig(file)
     data = file.read_bytes()

@@ -36,17 +36,10 @@ GRID = 9
 
 @dataclass(frozen=True, eq=False)
 class Twin:
-    """A true rig beside the rig that is believed, and how it was drawn.
+    """A true rig, drawn ``by`` ``fit.covariance`` or ``stated sigmas`` about the one that is believed.
 
-    Attributes
-    ----------
-    true_rig
-        What is simulated.
-    by
-        ``fit.covariance`` or ``stated sigmas``.
-    apart_px
-        By camera: how far apart at most, over the picture, the two models see one thing 5 m away, in the
-        frame that the camera is mounted on.
+    ``apart_px``: by camera how far apart at most, over the image, the two models see one thing 5 m away, in
+    the frame that the camera is mounted on.
     """
 
     true_rig: Rig

@@ -1,4 +1,4 @@
-"""One daemon after the other in this process, and what a test asks of its rover.
+"""One daemon after the other in this process, and the requests of a test to its rover.
 
 A test gets a daemon of its own. Nothing of the test before is left: no faults, track, stop, mast file in use,
 place of head and rover, or time of the clock.
@@ -34,7 +34,7 @@ class Daemons:
         self._config: Config | None = None  # of the one that runs, or ran last
 
     def do(self, word: str, order: dict[str, Any]) -> Any:
-        """Carry out an order and return what there is to say, fit for JSON."""
+        """Carry out an order and return its answer, fit for JSON."""
         action = getattr(self, f"_do_{word}")
         if word in ("open", "close", "start") or self._daemon is None:
             return action(**order)
@@ -117,19 +117,11 @@ class Daemons:
 def config_for_a_test(
     path: str | None, picture_width_px: int | None, simulation: dict[str, Any], folder: Path
 ) -> Config:
-    """Return a configuration as a test wants it.
+    """Return the configuration of a test's rover, from a file or the packaged one.
 
-    Parameters
-    ----------
-    path
-        Its file; None for the packaged one.
-    picture_width_px
-        The width of every camera's pictures; None as the files have it.
-    simulation
-        Keys of the ``simulation`` section, in place of the file's. A file that does not say gets one ray a
-        pixel, and ``speed: max`` if its head has no wire.
-    folder
-        Where to write mast files, if any.
+    ``simulation`` has keys in place of that section's; a file without them gets one ray a pixel, and ``speed:
+    max`` if its head has no wire. New mast files, for another width of the images, are written into
+    ``folder``.
 
     Raises
     ------

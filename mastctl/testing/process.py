@@ -28,14 +28,8 @@ END_S = 5.0
 class RoverProcess:
     """A process for one daemon after the other: the compiled renderer and the ground are made once.
 
-    It ends with `close`, and by itself when the process that made it is gone, however that went.
-
-    Parameters
-    ----------
-    log
-        The file that gets what the daemons say on stderr; temporary files go beside it.
-    workers
-        How many such processes share this machine: each takes its part of the processors.
+    It ends with `close`, and by itself when the process that made it is gone. ``log`` is the file of the
+    daemons' stderr, and temporary files go beside it; ``workers`` such processes share the processors.
     """
 
     def __init__(self, log: Path, workers: int = 1) -> None:
@@ -68,18 +62,12 @@ class RoverProcess:
         return self._process.poll() is None
 
     def open(self, options: Mapping[str, Any]) -> str:
-        """Start a daemon in place of the one before and return its address.
+        """Start a daemon in place of the one before and return its address. Raises RoverError."""
+        return str(self._answer({"do": "open", **options}, START_S)["url"])
 
-        Raises
-        ------
-        RoverError
-            If the daemon refuses to start.
-        """
-        return str(self._asked({"do": "open", **options}, START_S)["url"])
-
-    def ask(self, do: str, **what: Any) -> Any:
-        """Have something done, and return the answer. Raises RoverError."""
-        return self._asked({"do": do, **what}, ANSWER_S)
+    def ask(self, do: str, **parameters: Any) -> Any:
+        """Have an order carried out, and return its answer. Raises RoverError."""
+        return self._answer({"do": do, **parameters}, ANSWER_S)
 
     def close(self) -> None:
         """End it; bounded."""
@@ -94,7 +82,7 @@ class RoverProcess:
             process.kill()
             process.wait()
 
-    def _asked(self, order: dict[str, Any], within_s: float) -> Any:
+    def _answer(self, order: dict[str, Any], within_s: float) -> Any:
         stdin = self._process.stdin
         assert stdin is not None
         with self._lock:

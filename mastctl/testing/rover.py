@@ -11,13 +11,7 @@ Ask = Callable[..., Any]
 
 
 class RoverError(Exception):
-    """The request to the simulated rover cannot be fulfilled: one plain sentence.
-
-    Attributes
-    ----------
-    code
-        The daemon's word for it.
-    """
+    """The request to the simulated rover cannot be fulfilled: one sentence, and the daemon's ``code``."""
 
     def __init__(self, message: str, code: str = "failed") -> None:
         self.code = code
@@ -25,13 +19,7 @@ class RoverError(Exception):
 
 
 class SetFault:
-    """A fault that is set. Leaving it as a context, or `clear`, takes it back.
-
-    Attributes
-    ----------
-    device, word
-        As they were given.
-    """
+    """A fault that is set. Leaving it as a context, or `clear`, takes it back."""
 
     def __init__(self, ask: Ask, device: str, word: str) -> None:
         self._ask = ask
@@ -78,10 +66,7 @@ class SimulatedRover:
     def true_point(self, frame_id: str, x_px: float, y_px: float) -> tuple[float, float, float] | None:
         """Return the point that a pixel of a frame shows, metres in the true rover frame; None for sky.
 
-        Raises
-        ------
-        RoverError
-            For a frame that this daemon did not take, or that is longer ago than the 512 newest.
+        Raises RoverError for a frame that is not among the 512 newest of this daemon.
         """
         point = self._ask("point", frame_id=frame_id, pixel_px=[float(x_px), float(y_px)])
         return None if point is None else (point[0], point[1], point[2])
@@ -89,7 +74,7 @@ class SimulatedRover:
     def true_pixel(self, frame_id: str, position_m: Sequence[float]) -> tuple[float, float] | None:
         """Return the pixel where a point, metres in the true rover frame, lies in a frame.
 
-        None where the camera cannot see; whether something stands before the point is not asked. Raises
+        None where the camera cannot see; whether something stands before the point is not checked. Raises
         RoverError as `true_point`, and for a position that is not three numbers.
         """
         if len(position_m) != 3:
@@ -105,13 +90,7 @@ class SimulatedRover:
     def stand(
         self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
     ) -> None:
-        """Put the rover somewhere on its ground, at once; the daemon does not learn of it.
-
-        Raises
-        ------
-        RoverError
-            Off the ground.
-        """
+        """Put the rover on its ground, at once and unknown to the daemon. Raises RoverError off it."""
         self._ask("stand", place=[float(v) for v in (x_m, y_m, heading_rad, pitch_rad, roll_rad)])
 
     def now_s(self) -> float:
@@ -133,29 +112,16 @@ class SimulatedRover:
     def start_daemon(self) -> None:
         """Start the daemon that `end_daemon` ended, at the same address, with a rover just switched on.
 
-        Raises
-        ------
-        RoverError
-            If it runs, or the address has been taken meanwhile.
+        Raises RoverError if it runs, or the address has been taken meanwhile.
         """
         self._ask("start")
 
     def set_fault(self, device: str, word: str, **parameters: float) -> SetFault:
-        """Set a fault, in place of one with the same word on the same device.
+        """Set a fault of docs/drivers.md, in place of one with the same word on the same device.
 
-        Parameters
-        ----------
-        device
-            ``pan_tilt``, or a camera's name.
-        word
-            A fault word of docs/drivers.md.
-        **parameters
-            Those of the word, and ``after_s`` and ``for_s`` of every word.
-
-        Raises
-        ------
-        RoverError
-            For an unknown device, word or parameter, or a value out of its bounds.
+        ``device`` is ``pan_tilt`` or a camera's name; every fault has the parameters ``after_s`` and
+        ``for_s`` beside its own. Raises RoverError for an unknown device, word or parameter, or a value out
+        of bounds.
         """
         self._ask("set_fault", device=device, word=word, parameters=parameters)
         return SetFault(self._ask, device, word)

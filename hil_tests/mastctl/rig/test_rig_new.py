@@ -88,7 +88,7 @@ class Bench:
 def nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine into which nothing is plugged."""
     monkeypatch.setattr(plugged, "serial_lines", lambda machine: [])
-    monkeypatch.setattr(plugged, "ask_cameras", lambda: ([], []))
+    monkeypatch.setattr(plugged, "query_cameras", lambda: ([], []))
 
 
 @pytest.fixture
