@@ -153,17 +153,6 @@ def learned(one: Pace | None, other: Pace | None, before: Offset | None = None) 
         return Offset(max(one.period_s, other.period_s))
     period_s = max(_measured_period_s(one.period_s, ones), _measured_period_s(other.period_s, others))
     triggered = one.trigger != "" and one.trigger == other.trigger
-    return learned_from(ones, others, period_s, triggered, None if before is None else before.usual_s)
-
-
-def learned_from(
-    ones: Sequence[FrameTime],
-    others: Sequence[FrameTime],
-    period_s: float,
-    triggered: bool = False,
-    before_s: float | None = None,
-) -> Offset:
-    """Return what the times of two cameras' last frames tell, oldest first; `LEAST_TO_LEARN` of each."""
     times_s = np.array([frame.exposure_began_s for frame in ones])
     theirs_s = np.array([frame.exposure_began_s for frame in others])
     nearest = np.abs(theirs_s[:, None] - times_s[None, :]).argmin(axis=1)
@@ -173,7 +162,9 @@ def learned_from(
     usual_s = float(np.median(apart_s))
     spread_s = float(np.median(np.abs(apart_s - usual_s)))
     usual_s -= period_s * round(usual_s / period_s)
-    same_s = usual_s if before_s is None else usual_s - period_s * round((usual_s - before_s) / period_s)
+    same_s, was_s = usual_s, None if before is None else before.usual_s
+    if was_s is not None:
+        same_s -= period_s * round((usual_s - was_s) / period_s)
     if abs(same_s) <= period_s / 2 + SLOP_S:
         usual_s = same_s
     counts_apart = None

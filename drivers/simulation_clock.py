@@ -114,9 +114,7 @@ class SimulationClock:
     def sleep(self, duration_s: float) -> None:
         """Wait for ``duration_s`` seconds of this clock; nothing for zero or less."""
         if duration_s > 0:
-            with self._central:
-                waiting = self._begin_wait(duration_s, None, False)
-            self._end_wait(waiting)
+            self.end_wait(self.begin_wait(duration_s, None, False))
 
     def signal(self) -> SimulationSignal:
         """Return a new condition variable whose waits end by this clock."""
@@ -142,7 +140,7 @@ class SimulationClock:
                 self._stand()
                 self._guests.append(guest)
                 self._go_on()
-            self._end_wait(guest)
+            self.end_wait(guest)
         try:
             yield
         finally:
@@ -186,26 +184,22 @@ class SimulationClock:
             with self._central:
                 self._give_up_turn(member)
 
-    def begin_wait(self, timeout_s: float | None, signal: SimulationSignal, idle: bool) -> _Waiting:
-        """Let the calling thread wait for a signal, whose lock it holds."""
+    def begin_wait(self, timeout_s: float | None, signal: SimulationSignal | None, idle: bool) -> _Waiting:
+        """Let the calling thread wait for a moment or a signal, whose lock it has."""
+        member: _Member | None = getattr(self._known, "member", None)
         with self._central:
-            return self._begin_wait(math.inf if timeout_s is None else max(0.0, timeout_s), signal, idle)
+            self._stand()
+            until_s = math.inf if timeout_s is None else self._now_s + max(0.0, timeout_s)
+            waiting = _Waiting(member, until_s, signal, idle)
+            self._waiting.append(waiting)
+            if member is None:
+                self._go_on()
+            else:
+                self._give_up_turn(member)
+        return waiting
 
     def end_wait(self, waiting: _Waiting) -> bool:
         """Return when the wait is over: whether by a notification."""
-        self._end_wait(waiting)
-        return waiting.notified
-
-    def notify(self, signal: SimulationSignal) -> None:
-        """Let all go on that wait for a signal."""
-        with self._central:
-            self._stand()
-            for waiting in [one for one in self._waiting if one.signal is signal]:
-                waiting.notified = True
-                self._release(waiting)
-            self._go_on()
-
-    def _end_wait(self, waiting: _Waiting) -> None:
         try:
             waiting.gone_on.wait()
         except BaseException:  # Ctrl-C in the main thread: it waits no longer
@@ -217,6 +211,16 @@ class SimulationClock:
                     self._give_up_turn(waiting.member)
             self._known.member = None
             raise
+        return waiting.notified
+
+    def notify(self, signal: SimulationSignal) -> None:
+        """Let all go on that wait for a signal."""
+        with self._central:
+            self._stand()
+            for waiting in [one for one in self._waiting if one.signal is signal]:
+                waiting.notified = True
+                self._release(waiting)
+            self._go_on()
 
     # With the central lock held
 
@@ -232,17 +236,6 @@ class SimulationClock:
         """Let the clock go on from where it is now."""
         self._now_s = self._reached_s()
         self._went_s = time.monotonic()
-
-    def _begin_wait(self, duration_s: float, signal: SimulationSignal | None, idle: bool) -> _Waiting:
-        self._stand()
-        member: _Member | None = getattr(self._known, "member", None)
-        waiting = _Waiting(member, self._now_s + duration_s, signal, idle)
-        self._waiting.append(waiting)
-        if member is None:
-            self._go_on()
-        else:
-            self._give_up_turn(member)
-        return waiting
 
     def _give_up_turn(self, member: _Member) -> None:
         if self._turn is member:

@@ -72,42 +72,6 @@ def load_after_rad(
 
 
 @dataclass(frozen=True)
-class Ringing:
-    """A mode.
-
-    Attributes
-    ----------
-    frequency_hz
-        Natural frequency ω/2π, above zero.
-    damping
-        ζ, between 0 and 1, both excluded.
-    gain
-        g: 1 if all of the load takes part, as on a motor that turns it through a spring.
-    """
-
-    frequency_hz: float
-    damping: float
-    gain: float
-
-    def ahead_rad(self, motion: Motion, time_s: float) -> float:
-        """Return by how much the load is ahead of where the gears put it, radians."""
-        omega = math.tau * self.frequency_hz
-        decay = self.damping * omega
-        damped = omega * math.sqrt(1 - self.damping**2)
-        left, acceleration = 0.0, 0.0
-        for shock in motion.shocks(time_s):
-            step, acceleration = shock.acceleration_rad_per_s2 - acceleration, shock.acceleration_rad_per_s2
-            by_step, by_jump = step / omega**2, shock.jump_rad_per_s / damped
-            envelope = math.exp(-decay * (time_s - shock.time_s))
-            if self.gain * (2 * abs(by_step) + abs(by_jump)) * envelope < STILL_RAD:
-                continue
-            phase = damped * (time_s - shock.time_s)
-            swing = by_step * (math.cos(phase) + decay / damped * math.sin(phase))
-            left += envelope * (swing - by_jump * math.sin(phase))
-        return self.gain * (left - acceleration / omega**2)
-
-
-@dataclass(frozen=True)
 class AxisSettings:
     """One axis of a head.
 
@@ -127,7 +91,8 @@ class AxisSettings:
     harmonics_rad
         What the encoder is wrong by over a turn (`drivers.sim.axis`); empty: it reads true.
     ring_hz, ring_damping, ring_gain
-        The mode that rings after a move (`drivers.sim.axis`); 0 Hz: none.
+        The mode that rings after a move: ω/2π (0: none), ζ between 0 and 1, and g, which is 1 if all of the
+        load takes part, as on a motor that turns it through a spring.
     settle_s
         How long after it has come to rest the head in memory says that it moves.
     """
@@ -185,8 +150,26 @@ class Axis:
         load, s = self.load_rad(time_s), self.settings
         angle = load - s.sag_rad * math.cos(load)
         if s.ring_hz > 0:
-            angle += Ringing(s.ring_hz, s.ring_damping, s.ring_gain).ahead_rad(self.motion, time_s)
+            angle += self._ahead_rad(time_s)
         return angle
+
+    def _ahead_rad(self, time_s: float) -> float:
+        """By how much ringing puts the load ahead of where the gears put it."""
+        s = self.settings
+        omega = math.tau * s.ring_hz
+        decay = s.ring_damping * omega
+        damped = omega * math.sqrt(1 - s.ring_damping**2)
+        left, acceleration = 0.0, 0.0
+        for shock_s, shock_rad_per_s2, jump_rad_per_s in self.motion.shocks(time_s):
+            step, acceleration = shock_rad_per_s2 - acceleration, shock_rad_per_s2
+            by_step, by_jump = step / omega**2, jump_rad_per_s / damped
+            envelope = math.exp(-decay * (time_s - shock_s))
+            if s.ring_gain * (2 * abs(by_step) + abs(by_jump)) * envelope < STILL_RAD:
+                continue
+            phase = damped * (time_s - shock_s)
+            swing = by_step * (math.cos(phase) + decay / damped * math.sin(phase))
+            left += envelope * (swing - by_jump * math.sin(phase))
+        return s.ring_gain * (left - acceleration / omega**2)
 
     def followed_by(self, motion: Motion, time_s: float) -> Axis:
         """With a motion that continues this one from ``time_s``; the load's state is carried over."""

@@ -66,19 +66,16 @@ def stone(rng: np.random.Generator, size: int) -> Float32:
     return np.asarray(tones / tones.mean(), dtype=np.float32)
 
 
-def halved(tones: Float32) -> list[Float32]:
-    """Return ``tones`` and its 2 x 2 means, over and over, down to 4 texels across; edges stay aligned."""
+def pyramid(tones: Float32, texel_m: float) -> Any:
+    """Return the ``kernels.Texture`` of a square picture of relative brightness, side a power of two.
+
+    Each level is the 2 x 2 means of the one before, down to 4 texels across, so that edges stay aligned.
+    """
+    module = kernels()
     levels = [np.asarray(tones, dtype=np.float32)]
     while levels[-1].shape[0] > 4:
         n = levels[-1].shape[0] // 2
         levels.append(levels[-1].reshape(n, 2, n, 2).mean(axis=(1, 3), dtype=np.float32))
-    return levels
-
-
-def pyramid(tones: Float32, texel_m: float) -> Any:
-    """Return the ``kernels.Texture`` of a square picture of relative brightness, side a power of two."""
-    module = kernels()
-    levels = halved(tones)
     padded = [np.pad(level, [(0, 1), (0, module.PAD)], mode="wrap") for level in levels]
     texels = np.concatenate([level.ravel() for level in padded])
     start = np.cumsum([0, *(level.size for level in padded[:-1])]).astype(np.int64)

@@ -17,7 +17,6 @@ import scipy
 from drivers.sim import ground, placed, rocks, scene
 from drivers.sim.compiled import kernels
 from drivers.sim.kept import digest_of, keep_newest, kept_folder
-from drivers.sim.rocks import Brick
 from drivers.sim.scene import Scene, SceneSettings, build_scene
 
 FACTS = "scene.json"
@@ -59,9 +58,6 @@ def write(folder: Path, made: Scene) -> None:
                 np.save(scratch / f"{name}.npy", value)
             else:
                 facts[name] = value
-        np.save(
-            scratch / "bricks.npy", np.array([brick.corners_m for brick in made.bricks]).reshape(-1, 8, 3)
-        )
         (scratch / FACTS).write_text(json.dumps(facts))
         shutil.rmtree(folder, ignore_errors=True)  # what is there was not good
         scratch.replace(folder)
@@ -93,7 +89,6 @@ def read(folder: Path, settings: SceneSettings) -> Scene:
         return kind(*(part(f"world.{field}.{name}") for name in kind._fields))
 
     world = module.World(*(of_world(field) for field in module.World._fields))
-    corners_m = np.load(folder / "bricks.npy")
     with contextlib.suppress(OSError):
         os.utime(folder)  # used last
-    return Scene(settings, world, tuple(Brick(one) for one in corners_m))
+    return Scene(settings, world)

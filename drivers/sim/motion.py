@@ -12,7 +12,6 @@ from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 HISTORY_S = 60.0
 """How long a superseded leg is remembered, seconds."""
@@ -114,14 +113,6 @@ def rest(time_s: float, position_rad: float) -> Leg:
     return Leg(time_s, position_rad, 0.0, position_rad, 1.0, 1.0)
 
 
-class Shock(NamedTuple):
-    """From a moment on an axis accelerates this much; there its velocity jumps, if a fault seizes it."""
-
-    time_s: float
-    acceleration_rad_per_s2: float
-    jump_rad_per_s: float
-
-
 @dataclass(frozen=True)
 class Motion:
     """The legs of an axis, oldest first; a leg holds until the next one starts.
@@ -144,8 +135,12 @@ class Motion:
         """Return position (rad) and velocity (rad/s) at a moment."""
         return self.legs[self.leg_index(time_s)].at(time_s)
 
-    def shocks(self, until_s: float) -> Iterator[Shock]:
-        """Yield what shook the axis until a moment, oldest first."""
+    def shocks(self, until_s: float) -> Iterator[tuple[float, float, float]]:
+        """Yield what shook the axis until a moment, oldest first.
+
+        From a moment (s) on it accelerates so much (rad/s²); there its velocity jumps (rad/s), if a fault
+        seizes it.
+        """
         speed = self.legs[0].start_rad_per_s
         for number, leg in enumerate(self.legs):
             after = self.legs[number + 1 :]
@@ -158,7 +153,7 @@ class Motion:
             for time_s, acceleration in leg.accelerations():
                 if time_s >= end_s or time_s > until_s:
                     break
-                yield Shock(time_s, acceleration, jump)
+                yield time_s, acceleration, jump
                 jump = 0.0
             speed = leg.at(end_s)[1]
 

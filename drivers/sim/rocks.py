@@ -6,7 +6,6 @@ Rocks are irregular, nearly convex; bricks are level boxes of exactly known corn
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -162,46 +161,36 @@ def spheres(corners_m: Float64) -> Float64:
     return np.column_stack([centre, radius * (1.0 + 1e-9)])
 
 
-@dataclass(frozen=True, eq=False)
-class Brick:
-    """One brick.
-
-    Attributes
-    ----------
-    corners_m
-        (8, 3) site frame: the four at the top, then those under them.
-    """
-
-    corners_m: Float64
-
-
 def make_brick(
     x_m: float,
     y_m: float,
     turn_rad: float,
     ground_z_m: Callable[[float, float], float],
     size_m: tuple[float, float, float] = BRICK_SIZE_M,
-) -> Brick:
-    """Return a brick (length, width, height) about (x, y), its length turned from north to east."""
+) -> Float64:
+    """Return the corners (8, 3) of a brick of length, width and height about (x, y), site frame, metres.
+
+    Its length is turned from north to east. The four corners at the top come first, then those under them.
+    """
     length, width, height = size_m
     flat = 0.5 * np.array([[length, width], [length, -width], [-length, -width], [-length, width]])
     cos, sin = np.cos(turn_rad), np.sin(turn_rad)
     around = flat @ np.array([[cos, sin], [-sin, cos]]) + [x_m, y_m]
     bottom = max(float(ground_z_m(x, y)) for x, y in around) + BRICK_SUNK_M
     top = np.column_stack([around, np.full(4, bottom - height)])
-    return Brick(np.concatenate([top, top + np.array([0.0, 0.0, height])]))
+    return np.concatenate([top, top + np.array([0.0, 0.0, height])])
 
 
 def scattered(
     count: int, rng: np.random.Generator, taken_m: Float64, ground_z_m: Callable[[float, float], float]
-) -> tuple[Brick, ...]:
+) -> list[Float64]:
     """Return up to ``count`` bricks, by turns near and far, apart from each other.
 
     ``taken_m`` (n, 4) are balls (centre, radius) that keep their place.
     """
     reach = 0.5 * float(np.hypot(*BRICK_SIZE_M[:2]))
     taken = [(float(x), float(y), float(r)) for x, y, _, r in taken_m]
-    found: list[Brick] = []
+    found: list[Float64] = []
     for index in range(count):
         nearest, farthest, azimuth = BRICK_RINGS_M[index % len(BRICK_RINGS_M)]
         for _ in range(300):
@@ -211,10 +200,10 @@ def scattered(
                 found.append(make_brick(x, y, rng.uniform(0.0, np.pi), ground_z_m))
                 taken.append((x, y, reach))
                 break
-    return tuple(found)
+    return found
 
 
-def meshes(bricks: Sequence[Brick]) -> Any:
+def meshes(bricks: Sequence[Float64]) -> Any:
     """Return the ``kernels.Rocks`` of bricks: each a closed mesh of 20 triangles, divided as rocks are."""
     corners = np.array([divided(_triangles(brick), lambda middles: middles) for brick in bricks])
     corners = corners.reshape(len(bricks), -1, 3, 3)
@@ -227,10 +216,9 @@ def meshes(bricks: Sequence[Brick]) -> Any:
     )
 
 
-def _triangles(brick: Brick) -> Float64:
+def _triangles(brick: Float64) -> Float64:
     """The 20 triangles (20, 3, 3): four about the middle of each side, two on the top and the bottom."""
-    p = brick.corners_m
-    out = []
+    p, out = brick, []
     for side in _SIDES:
         middle = p[list(side)].mean(axis=0)
         out += [(p[side[k]], p[side[(k + 1) % 4]], middle) for k in range(4)]

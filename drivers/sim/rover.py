@@ -312,16 +312,10 @@ class RoverModel:
             self._renderer.close()
 
     def _camera(self, name: str, clock: Clock, start_s: float) -> SimulatedCamera:
-        """One camera that looks through the true rig."""
-
-        def expose(begin_s: float, exposure_s: float) -> NDArray[np.float32]:
-            return self._exposed(name, begin_s, exposure_s)
-
-        def taken(sequence: int, mid_exposure_s: float) -> None:
-            self._remember(name, sequence, mid_exposure_s)
-
+        """One camera of the true rig."""
         settings, size_px = self.settings.camera, self.rig.cameras[name].model.size_px
         own = self.settings.clocks.get(name, ClockSettings())
+        expose, taken = partial(self._exposed, name), partial(self._remember, name)
         usual = (name, settings, size_px, expose, taken, clock, self.faults, start_s, own)
         return SimulatedCamera(*usual, self.sensor_modes[name], partial(self._metered, name))
 

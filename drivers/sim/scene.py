@@ -31,7 +31,6 @@ from drivers.sim.placed import (
     placed_or,
     radius_m,
 )
-from drivers.sim.rocks import Brick
 
 Float64 = NDArray[np.float64]
 
@@ -78,10 +77,9 @@ class SceneSettings(DriverOptions):
 class Scene:
     """Ground, rocks, bricks and light, ready for casting rays; made by ``build_scene``, never changed."""
 
-    def __init__(self, settings: SceneSettings, world: Any, bricks: tuple[Brick, ...] = ()) -> None:
+    def __init__(self, settings: SceneSettings, world: Any) -> None:
         self.settings = settings
         self.world = world
-        self.bricks = bricks
 
     def cast(self, origins_m: ArrayLike, directions: ArrayLike) -> Float64:
         """Return how far rays go before they meet the ground or a rock.
@@ -154,7 +152,7 @@ def build_scene(settings: SceneSettings | None = None) -> Scene:
     stone = ground.pyramid(ground.stone(stone_rng, ground.STONE_TEXELS), ground.STONE_TEXEL_M)
     broad = ground.pyramid(tones, INNER_CELL_M)
     world = kernels().World(inner, outer, stones, detail, broad, stone, sun)
-    return Scene(settings, world, laid)
+    return Scene(settings, world)
 
 
 def laid_out(
@@ -163,7 +161,7 @@ def laid_out(
     brick_rng: np.random.Generator,
     placed_rng: np.random.Generator,
     ground_m: Callable[[float, float], float],
-) -> tuple[Any, tuple[Brick, ...]]:
+) -> tuple[Any, list[Float64]]:
     """Return ``kernels.Rocks`` of the stones, and the bricks; scattered ones keep away from placed things."""
     placed = settings.placed.values()
     taken_m = np.array([[*middle_m(thing), 0.0, radius_m(thing)] for thing in placed]).reshape(-1, 4)
@@ -178,12 +176,12 @@ def laid_out(
         )
         stones = type(stones)(*(np.ascontiguousarray(part[free]) for part in stones))
     if isinstance(settings.bricks, tuple):
-        return stones, tuple(
+        return stones, [
             rocks.make_brick(
                 one.x_m, one.y_m, one.heading_rad, ground_m, (one.length_m, one.width_m, one.height_m)
             )
             for one in settings.bricks
-        )
+        ]
     taken_m = np.concatenate([stones.spheres_m, taken_m])
     return stones, rocks.scattered(settings.bricks, brick_rng, taken_m, ground_m)
 

@@ -328,7 +328,7 @@ def with_bricks(scene: Scene, distance_m: float, azimuth: float, rng: np.random.
         turn = azimuth + math.pi / 2 + float(rng.uniform(-0.3, 0.3))
         row.append(make_brick(x, y, turn, scene.ground_z_m))
     stones = together(scene.world.rocks, meshes(row))
-    return Scene(scene.settings, scene.world._replace(rocks=stones), (*scene.bricks, *row))
+    return Scene(scene.settings, scene.world._replace(rocks=stones))
 
 
 def faded(scene: Scene, contrast: float, broad: bool = True) -> Scene:
@@ -341,7 +341,7 @@ def faded(scene: Scene, contrast: float, broad: bool = True) -> Scene:
         return picture._replace(texels=texels.astype(np.uint16))
 
     changed = world._replace(detail=less(world.detail), broad=less(world.broad) if broad else world.broad)
-    return Scene(scene.settings, changed, scene.bricks)
+    return Scene(scene.settings, changed)
 
 
 def repeated(scene: Scene, count: int, natural: float, rng: np.random.Generator) -> Scene:
@@ -352,7 +352,7 @@ def repeated(scene: Scene, count: int, natural: float, rng: np.random.Generator)
     tones = np.clip(np.tile(tile, (count, count)) * (1.0 + natural * (gravel - 1.0)), 0.1, 1.9)
     detail = ground.pyramid(tones.astype(np.float32), ground.DETAIL_TEXEL_M)
     plain = faded(scene, 0.1)
-    return Scene(scene.settings, plain.world._replace(detail=detail), scene.bricks)
+    return Scene(scene.settings, plain.world._replace(detail=detail))
 
 
 @dataclass(frozen=True, eq=False)

@@ -109,16 +109,18 @@ def test_a_charuco_board_is_where_exact_geometry_puts_it(placed: Scene, picture:
 
 
 def test_a_brick_is_met_where_its_numbers_put_it(placed: Scene) -> None:
-    (brick,) = placed.bricks
+    points_m = placed.world.rocks.corners_m[-1].reshape(-1, 3)
     ahead, right = (np.array([math.cos(a), math.sin(a), 0.0]) for a in (0.4, 0.4 + math.pi / 2))
     for along, across in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         outwards = along * ahead + across * right
         half = 0.25 if along else 0.15
-        top_m = brick.corners_m[:4, 2].mean()
+        top_m = points_m[:, 2].min()
         start = np.array([2.2, 0.1, top_m + 0.05]) + 1.0 * outwards
         assert placed.cast(start, -outwards) == pytest.approx(1.0 - half, abs=1e-9)
     assert placed.cast([2.2, 0.1, -3.0], [0.0, 0.0, 1.0]) == pytest.approx(3.0 + top_m, abs=1e-9)
-    sunk_m = [z - placed.ground_z_m(x, y) for x, y, z in brick.corners_m[4:]]
+    away_m = np.hypot(points_m[:, 0] - 2.2, points_m[:, 1] - 0.1)
+    lowest = (points_m[:, 2] > points_m[:, 2].max() - 1e-9) & (away_m > away_m.max() - 1e-9)
+    sunk_m = [z - placed.ground_z_m(x, y) for x, y, z in points_m[lowest]]
     assert min(sunk_m) == pytest.approx(0.02), "no gap under it"
 
 
