@@ -17,15 +17,15 @@ from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, check_fold
 if TYPE_CHECKING:
     from drivers.probes import ProbedHead
     from mastctl.answers import Status
-    from mastctl.rig.drawing import RigAnswers
-    from mastctl.rig.plugged import Plugged
-    from mastctl.rig.questions import Prompts
+    from mastctl.setup.drawing import RigAnswers
+    from mastctl.setup.plugged import Plugged
+    from mastctl.setup.questions import Prompts
 
 NOTHING = "no head and no camera is plugged in; write a simulated twin, which runs"
 TWIN_DEG = {"pan": 175.0, "tilt": 90.0}
 """The reach of the simulated head to each side."""
 LEAST_DEG = 15.0
-"""Between the ends of an axis: both keep a margin (`mastctl.rig.drawing.MARGIN_RAD`)."""
+"""Between the ends of an axis: both keep a margin (`mastctl.setup.drawing.MARGIN_RAD`)."""
 MOST_BOARDS = 12
 HEADS = "ptu_d46_70|dynamixel_x|ph42"
 OF_NUMBERS = ("height", "baseline", "focal_px", "view_deg", "size", "name")
@@ -62,10 +62,10 @@ def _port(text: str) -> str:
 def _new(args: argparse.Namespace) -> Answer:
     """Query, ask, write, and return the next commands."""
     from drivers.servo_bus.bench import ServosOnLine
-    from mastctl.rig.folder import check_free, write_rig, write_simulated
-    from mastctl.rig.plugged import find_plugged
-    from mastctl.rig.questions import Prompts
     from mastctl.setup.machine import ExaminedMachine
+    from mastctl.setup.new_folder import check_free, write_rig, write_simulated
+    from mastctl.setup.plugged import find_plugged
+    from mastctl.setup.questions import Prompts
 
     check_folder(args.folder, "FOLDER")
     check_free(args.folder)
@@ -127,7 +127,7 @@ def _answers(
 ) -> RigAnswers:
     """The values of the options, else of the person at the terminal, else the usual ones."""
     from drivers.servo_bus.bench import ServosOnLine
-    from mastctl.rig.drawing import RigAnswers
+    from mastctl.setup.drawing import RigAnswers
 
     usual = RigAnswers()
     ids = list(head.driven) if isinstance(head, ServosOnLine) else []

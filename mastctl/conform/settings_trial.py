@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 
 from drivers.interfaces import CameraSetting
-from mastctl.conform.checks import NotTried, expect
+from mastctl.conform.checks import NotTried, PromiseBroken, expect
 
 FRAMES = 20  # so many may be of unknown settings after a change
 PART = 0.05  # of its value a setting is changed by, one step at least
@@ -25,48 +25,45 @@ def settings_tried(
     in `drivers.interfaces.Camera`; ``of_a_frame`` returns the settings of a frame exposed from now on. Raises
     PromiseBroken, and NotTried if there is none to try.
     """
+
+    def value_of(name: str) -> float | None:
+        return next((one.value for one in read() if one.name == name), None)
+
+    def change(name: str, other: float) -> None:
+        """Set another value, and follow it to a frame."""
+        notes = adjust(name, other)
+        now = value_of(name)
+        if now is None:
+            raise PromiseBroken(f"{name} is not known after it was set to {other:.6g}")
+        message = f"{name} is {now:.6g} where {other:.6g} was set, and no note says so"
+        expect(_same(now, other) or notes, message)
+        for _ in range(FRAMES):
+            value = of_a_frame().get(name)
+            if value is not None:
+                message = f"a frame exposed after {name} was set to {now:.6g} has {value:.6g}"
+                expect(_same(value, now), message)
+                return
+        raise PromiseBroken(f"none of {FRAMES} frames after {name} was set has its value")
+
     tried = []
     for one in read():
         other = _beside(one)
         if other is None or one.value is None:
             continue
         try:
-            _change(one.name, other, read, adjust, of_a_frame)
+            change(one.name, other)
         except BaseException:
             with suppress(Exception):  # the first error counts
                 adjust(one.name, one.value)
             raise
         adjust(one.name, one.value)
-        back = _now(read, one.name)
+        back = value_of(one.name)
         message = f"{one.name} is {back} where {one.value:.6g} was put back"
         expect(back is not None and _same(back, one.value), message)
         tried.append(one.name)
     if not tried:
         raise NotTried("it has no setting but focus that can be changed now")
     return ", ".join(tried)
-
-
-def _change(
-    name: str,
-    other: float,
-    read: Callable[[], Sequence[CameraSetting]],
-    adjust: Callable[[str, float], Sequence[str]],
-    of_a_frame: Callable[[], Mapping[str, float | None]],
-) -> None:
-    """Set another value, and follow it to a frame."""
-    notes = adjust(name, other)
-    now = _now(read, name)
-    expect(now is not None, f"{name} is not known after it was set to {other:.6g}")
-    assert now is not None
-    message = f"{name} is {now:.6g} where {other:.6g} was set, and no note says so"
-    expect(_same(now, other) or notes, message)
-    for _ in range(FRAMES):
-        value = of_a_frame().get(name)
-        if value is not None:
-            message = f"a frame exposed after {name} was set to {now:.6g} has {value:.6g}"
-            expect(_same(value, now), message)
-            return
-    expect(False, f"none of {FRAMES} frames after {name} was set has its value")
 
 
 def _beside(one: CameraSetting) -> float | None:
@@ -78,10 +75,6 @@ def _beside(one: CameraSetting) -> float | None:
         by = math.floor(by / one.step + ROUNDING) * one.step
     within = (other for other in (one.value + by, one.value - by) if one.minimum <= other <= one.maximum)
     return next(within, None) if by > 0.0 else None
-
-
-def _now(read: Callable[[], Sequence[CameraSetting]], name: str) -> float | None:
-    return next((one.value for one in read() if one.name == name), None)
 
 
 def _same(one: float, other: float) -> bool:

@@ -252,10 +252,7 @@ def run_pointing_experiment(
 def head_pair(rig: Rig, served: set[str]) -> tuple[str, str]:
     """Return the stereo pair to point with: on the head, both cameras served; the Navcam where there is one.
 
-    Raises
-    ------
-    ClientError
-        ``no_stereo_pair``, if there is none.
+    Raises ClientError ``no_stereo_pair`` if there is none.
     """
     pairs = {
         name: pair

@@ -8,8 +8,8 @@ With the frame stamped t, the joint read at P(t), and s the sign of the motion, 
 
 o is the offset that is wanted, the same for all patches; c the time that a rolling shutter takes from the top
 of the picture to its bottom (y the patch's row in picture heights from the middle); h half the play of the
-gears, of which the readings see nothing. Going to and fro tells o and h from g, since they shift it
-oppositely on either way; going at several speeds tells o from h, since only o grows with the speed.
+gears, of which the readings see nothing. Going to and fro separates o and h from g, since they shift it
+oppositely on either way; several speeds separate o from h, since only o grows with the speed.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from calib.geometry.rigid import FloatArray
 from mastctl.setup.sync_motion import LEAST_FRAMES, CannotTell, JointMotion
 
 REACH_S = 0.6
-"""How far off a camera's stamps are looked for, seconds either way."""
+"""How far off a camera's stamps are searched, seconds either way."""
 
 SEARCH_STEP_S = 0.01
 LEAST_LEGS = 8

@@ -29,13 +29,7 @@ class CannotTell(MastctlError):
 
 
 class JointMotion:
-    """The joint angle over time by its readings, cut into legs between turns back.
-
-    Parameters
-    ----------
-    times_s, angles_rad
-        (m,) readings in the order of their times.
-    """
+    """The joint angle over time by its readings (m,), cut into legs between turns back."""
 
     def __init__(self, times_s: FloatArray, angles_rad: FloatArray) -> None:
         self.times_s, first = np.unique(times_s, return_index=True)
@@ -55,14 +49,14 @@ class JointMotion:
         return np.asarray(self._speed(np.clip(times_s, self.times_s[0], self.times_s[-1])))
 
     def leg(self, times_s: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-        """Return which leg a moment is of (-1: it tells nothing) and the sign of that leg's motion."""
+        """Return which leg a moment is of (-1: of none) and the sign of that leg's motion."""
         turns_s = self.times_s[self._turns]
         leg = np.searchsorted(turns_s, times_s, side="right") - 1
         after = np.clip(np.searchsorted(self.times_s, times_s), 1, len(self.times_s) - 1)
         sure = (leg >= 0) & (times_s < self.times_s[-1])
         sure &= self.times_s[after] - self.times_s[after - 1] <= LARGEST_GAP_S
         known = np.clip(leg, 0, len(self._turns) - 1)
-        sure &= np.abs(self.slope(times_s)) >= LEAST_SPEED_RAD_PER_S  # one at rest tells nothing of time
+        sure &= np.abs(self.slope(times_s)) >= LEAST_SPEED_RAD_PER_S  # one at rest does not depend on time
         sure &= np.abs(self.at(times_s) - self.angles_rad[self._turns[known]]) >= LEAST_WAY_RAD
         return np.where(sure, leg, -1), self._signs[known]
 
@@ -115,20 +109,11 @@ FAR_M = 1e5
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Patches of one camera's picture, with where each is looked for.
+    """Patches of one camera's image, (2 HALF_PX + 1) squares of grey, and where each is searched.
 
-    Attributes
-    ----------
-    templates
-        (2 HALF_PX + 1) squares of grey.
-    centres_px
-        (p, 2) their places in the picture at rest.
-    windows_px
-        (p, 4) corners (x0, y0, x1, y1) of where their centres may come to lie, inclusive.
-    ways
-        (p, 2) unit vectors along which they move.
-    rows
-        (p,) their rows, picture heights from the middle.
+    ``centres_px`` (p, 2) are their places in the image at rest, ``windows_px`` (p, 4) the corners (x0, y0,
+    x1, y1), inclusive, of where their centres may come to lie, ``ways`` (p, 2) the unit vectors along which
+    they move, and ``rows`` (p,) their rows in image heights from the middle.
     """
 
     templates: tuple[Image, ...]
@@ -166,19 +151,10 @@ def grey_bytes(image: Image) -> Image:
 def choose_patches(
     image: Image, rig: Rig, camera: str, joints_rad: tuple[float, float], amplitude_rad: float
 ) -> Patches:
-    """Choose textured patches that stay in the picture while pan goes ``amplitude_rad`` to either side.
+    """Choose textured patches that stay in the image while pan goes ``amplitude_rad`` to either side.
 
-    Parameters
-    ----------
-    image
-        A picture at rest, at ``joints_rad`` (pan, tilt).
-    rig
-        For roughly where things go; the measurement itself does not use it.
-
-    Raises
-    ------
-    CannotTell
-        If nothing in it can be told from its surroundings.
+    ``image`` is of a head at rest at ``joints_rad`` (pan, tilt). ``rig`` predicts roughly where things go;
+    the measurement does not use it. Raises CannotTell if nothing differs from its surroundings.
     """
     picture = grey_bytes(image)
     height, width = picture.shape

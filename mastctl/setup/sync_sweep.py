@@ -252,7 +252,7 @@ class Sweep:
         except (DriverError, MastctlError) as error:
             seen.failure = str(error)
             return
-        except Exception as error:  # somebody else's driver may raise what it likes
+        except Exception as error:  # a foreign driver may raise anything
             seen.failure = f"its driver failed in next_frame: {type(error).__name__}: {error}"
             return
         if seen.failure:  # it took too long: the head may be turning already
@@ -264,7 +264,7 @@ class Sweep:
                 frame = camera.next_frame(after_s, FRAME_TIMEOUT_S)
                 self._take(seen, patches, frame)
                 after_s, lost = max(after_s, frame.mid_exposure_s - frame.exposure_s / 2), 0
-            except Exception as error:  # somebody else's driver may raise what it likes
+            except Exception as error:  # a foreign driver may raise anything
                 lost += 1
                 if lost == LOST_FRAMES and not self._over.is_set():
                     known = isinstance(error, DriverError)

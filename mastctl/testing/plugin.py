@@ -1,7 +1,7 @@
 """The pytest plug-in: ``mast_daemon``, ``mast_client``, ``simulated_rover`` and ``fault``.
 
 pytest loads it at every start of every project beside which mastctl is installed. So it imports only pytest
-and the standard library, and starts no process until a test asks for a fixture.
+and the standard library, and starts no process until a test uses a fixture.
 """
 
 from __future__ import annotations
@@ -138,9 +138,9 @@ def simulated_rover(request: pytest.FixtureRequest, _mast_processes: _Processes)
         refusal = str(error)
     if refusal:
         pytest.fail(f"no simulated rover for this test: {refusal}", pytrace=False)
-    yield SimulatedRover(process.ask, url)
+    yield SimulatedRover(process.request, url)
     try:
-        process.ask("close")
+        process.request("close")
     except RoverError:  # it has died, or hangs: the next test gets another one
         _mast_processes.close()
 
@@ -167,7 +167,7 @@ def fault(simulated_rover: SimulatedRover) -> Callable[..., SetFault]:
 
 
 def _options(request: pytest.FixtureRequest) -> dict[str, Any]:
-    """What the marker and the project's configuration ask for. Raises ValueError."""
+    """The options of the marker and the project's configuration. Raises ValueError."""
     ini = {name.removeprefix("mastctl_"): str(request.config.getini(name)).strip() for name in INI}
     wanted: dict[str, Any] = {"config": ini["config"] or None}
     wanted["picture_width_px"] = _number("picture_width_px", ini, USUAL_WIDTH_PX, AS_CONFIGURED)

@@ -47,7 +47,7 @@ class RoverProcess:
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 env={**share, **os.environ, "TMPDIR": str(log.parent)},  # killed, it clears nothing away
-                # Ctrl-C is for the tests; the daemon is asked by its fixture, which ends after them.
+                # Ctrl-C is for the tests; the daemon is ended by its fixture, after them.
                 start_new_session=True,
             )
 
@@ -65,7 +65,7 @@ class RoverProcess:
         """Start a daemon in place of the one before and return its address. Raises RoverError."""
         return str(self._answer({"do": "open", **options}, START_S)["url"])
 
-    def ask(self, do: str, **parameters: Any) -> Any:
+    def request(self, do: str, **parameters: Any) -> Any:
         """Have an order carried out, and return its answer. Raises RoverError."""
         return self._answer({"do": do, **parameters}, ANSWER_S)
 

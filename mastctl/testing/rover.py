@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Any
 
-Ask = Callable[..., Any]
-"""``ask(do, **what)``: has the daemon's process do something, and returns its answer; raises RoverError."""
+Request = Callable[..., Any]
+"""``request(do, **parameters)``: has the daemon's process carry out an order, and returns its answer."""
 
 
 class RoverError(Exception):
@@ -21,13 +21,13 @@ class RoverError(Exception):
 class SetFault:
     """A fault that is set. Leaving it as a context, or `clear`, takes it back."""
 
-    def __init__(self, ask: Ask, device: str, word: str) -> None:
-        self._ask = ask
+    def __init__(self, request: Request, device: str, word: str) -> None:
+        self._request = request
         self.device, self.word = device, word
 
     def clear(self) -> None:
         """Take the fault back; nothing if it is over already."""
-        self._ask("clear_fault", device=self.device, word=self.word)
+        self._request("clear_fault", device=self.device, word=self.word)
 
     def __enter__(self) -> SetFault:
         return self
@@ -54,13 +54,13 @@ class SimulatedRover:
         The daemon's address.
     """
 
-    def __init__(self, ask: Ask, url: str) -> None:
-        self._ask = ask
+    def __init__(self, request: Request, url: str) -> None:
+        self._request = request
         self.url = url
 
     def true_joints(self) -> tuple[float, float]:
         """Return the mechanical pan and tilt of now, radians."""
-        pan_rad, tilt_rad = self._ask("joints")
+        pan_rad, tilt_rad = self._request("joints")
         return pan_rad, tilt_rad
 
     def true_point(self, frame_id: str, x_px: float, y_px: float) -> tuple[float, float, float] | None:
@@ -68,7 +68,7 @@ class SimulatedRover:
 
         Raises RoverError for a frame that is not among the 512 newest of this daemon.
         """
-        point = self._ask("point", frame_id=frame_id, pixel_px=[float(x_px), float(y_px)])
+        point = self._request("point", frame_id=frame_id, pixel_px=[float(x_px), float(y_px)])
         return None if point is None else (point[0], point[1], point[2])
 
     def true_pixel(self, frame_id: str, position_m: Sequence[float]) -> tuple[float, float] | None:
@@ -79,23 +79,23 @@ class SimulatedRover:
         """
         if len(position_m) != 3:
             raise RoverError(f"position_m has {len(position_m)} numbers, expected three", "bad_request")
-        pixel = self._ask("pixel", frame_id=frame_id, position_m=[float(value) for value in position_m])
+        pixel = self._request("pixel", frame_id=frame_id, position_m=[float(value) for value in position_m])
         return None if pixel is None else (pixel[0], pixel[1])
 
     def true_pose(self) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
         """Return where the rover truly stands in the site frame: metres, and a quaternion (w, x, y, z)."""
-        position_m, quaternion = self._ask("pose")
+        position_m, quaternion = self._request("pose")
         return tuple(position_m), tuple(quaternion)
 
     def stand(
         self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
     ) -> None:
         """Put the rover on its ground, at once and unknown to the daemon. Raises RoverError off it."""
-        self._ask("stand", place=[float(v) for v in (x_m, y_m, heading_rad, pitch_rad, roll_rad)])
+        self._request("stand", place=[float(v) for v in (x_m, y_m, heading_rad, pitch_rad, roll_rad)])
 
     def now_s(self) -> float:
         """Return the rover's time, seconds: that of frames, readings and ``now_s`` in the status."""
-        return float(self._ask("now"))
+        return float(self._request("now"))
 
     def advance(self, duration_s: float) -> float:
         """Let time pass for the rover and return its time then.
@@ -103,18 +103,18 @@ class SimulatedRover:
         At ``speed: max`` nothing else makes time pass between two commands, and this returns at once; at any
         other speed it waits.
         """
-        return float(self._ask("advance", duration_s=float(duration_s)))
+        return float(self._request("advance", duration_s=float(duration_s)))
 
     def end_daemon(self) -> None:
         """End the daemon and the rover with it: the address does not answer from then on."""
-        self._ask("close")
+        self._request("close")
 
     def start_daemon(self) -> None:
         """Start the daemon that `end_daemon` ended, at the same address, with a rover just switched on.
 
         Raises RoverError if it runs, or the address has been taken meanwhile.
         """
-        self._ask("start")
+        self._request("start")
 
     def set_fault(self, device: str, word: str, **parameters: float) -> SetFault:
         """Set a fault of docs/drivers.md, in place of one with the same word on the same device.
@@ -123,9 +123,9 @@ class SimulatedRover:
         ``for_s`` beside its own. Raises RoverError for an unknown device, word or parameter, or a value out
         of bounds.
         """
-        self._ask("set_fault", device=device, word=word, parameters=parameters)
-        return SetFault(self._ask, device, word)
+        self._request("set_fault", device=device, word=word, parameters=parameters)
+        return SetFault(self._request, device, word)
 
     def clear_faults(self) -> None:
         """Take back every fault, also those that the configuration sets."""
-        self._ask("clear_fault", device=None, word=None)
+        self._request("clear_fault", device=None, word=None)

@@ -3,7 +3,7 @@
 It takes one JSON order a line on stdin and answers each with one on stdout. It ends when stdin does, and
 when the process PARENT is gone: a copy of that process, forked by a test, may hold stdin open. A worker of
 pytest-xdist outlives the pytest that made it by many seconds, or by all of a test that sleeps: that pytest is
-looked for too.
+watched too.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 from typing import IO, Any
 
-PARENT_LOOKED_FOR_S = 0.25
+PARENT_CHECKED_S = 0.25
 
 
 def main() -> None:
@@ -45,12 +45,12 @@ def _watch(parent: int) -> None:
     """End with the process that made this one; the system names another parent when that is gone."""
     controller = _parent_of(parent) if "PYTEST_XDIST_WORKER" in os.environ else None
     while os.getppid() == parent and (controller is None or _parent_of(parent) == controller):
-        time.sleep(PARENT_LOOKED_FOR_S)
+        time.sleep(PARENT_CHECKED_S)
     os._exit(1)
 
 
 def _parent_of(pid: int) -> int | None:
-    """Who made a process; None where that cannot be told any more."""
+    """The id of a process's parent; None if it is gone."""
     try:
         after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2]
     except OSError:

@@ -25,16 +25,16 @@ from drivers.servo_bus.bench import USUAL_BAUD, ServosOnLine, line_words
 from drivers.sim.pan_tilt import DEFAULT_HEADS
 from mastctl.config import check_cameras, load_config
 from mastctl.packaged import SCHEMAS, config_folder, name_schema
-from mastctl.rig.drawing import (
+from mastctl.setup.drawing import (
     RigAnswers,
     camera_names,
     configuration,
     drawing,
     soft_limits,
 )
-from mastctl.rig.plugged import Plugged, lone_servo, usb_of
 from mastctl.setup.machine import ExaminedMachine
 from mastctl.setup.new_rig import RigNumbers, built_rig, focal_of
+from mastctl.setup.plugged import Plugged, lone_servo, usb_of
 from mastctl.setup.rig_folder import CONFIG, MAST, TRUE_RIG, InTheWay, write_built
 
 RULES, README = "60-mastctl.rules", "README.md"

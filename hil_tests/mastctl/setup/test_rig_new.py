@@ -38,14 +38,13 @@ from drivers.v4l2.options import parse_options
 from mastctl.cli.main import main
 from mastctl.config import load_config
 from mastctl.packaged import schema_files
-from mastctl.rig import folder as folder_module
-from mastctl.rig import plugged
-from mastctl.rig.drawing import RigAnswers
-from mastctl.rig.folder import README, RULES, write_rig
-from mastctl.rig.plugged import Plugged, head_probes
-from mastctl.rig.questions import Prompts
-from mastctl.setup import doctor
+from mastctl.setup import doctor, plugged
+from mastctl.setup import new_folder as folder_module
+from mastctl.setup.drawing import RigAnswers
 from mastctl.setup.machine import ExaminedMachine
+from mastctl.setup.new_folder import README, RULES, write_rig
+from mastctl.setup.plugged import Plugged, head_probes
+from mastctl.setup.questions import Prompts
 from mastctl.setup.rig_folder import CONFIG, MAST
 
 X = PRESETS["dynamixel_x"]

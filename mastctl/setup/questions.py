@@ -1,4 +1,4 @@
-"""What a person is asked about a rig at a terminal; without one the usual answers are taken."""
+"""Questions about a rig at a terminal; without one the usual answers are used."""
 
 from __future__ import annotations
 
@@ -46,5 +46,5 @@ class Prompts:
         self._out.flush()
         return self._source.readline().strip()
 
-    def _say(self, words: str) -> None:
-        self._out.write(f"{words}\n")
+    def _say(self, sentence: str) -> None:
+        self._out.write(f"{sentence}\n")

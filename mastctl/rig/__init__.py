@@ -1,1 +1,0 @@
-"""A rig of one's own: what is plugged in, and the files that describe it."""
