@@ -194,49 +194,49 @@ def _triangulated(
     return seen, Triangulation(*arrays)
 
 
-@np.errstate(all="ignore")
 def _meeting(left: CameraModel, right: CameraModel, left_px: FloatArray, right_px: FloatArray) -> _Meeting:
     """Return where the rays of pixels (n, 2) of both cameras come nearest."""
-    rays1, turn1, shift1 = left.ray_jacobian(left_px)
-    rays2, turn2, shift2 = right.ray_jacobian(right_px)
-    d1, d2, between = rays1.directions, rays2.directions, rays1.origins_m - rays2.origins_m
-    # The common normal's feet o1 + s1 d1 and o2 + s2 d2: the gap between them is perpendicular to d1 and d2.
-    cosines, normals = _dot(d1, d2)[:, None], crossed(d1, d2)
-    sines = np.sqrt(_dot(normals, normals))
-    per_sine2 = (1.0 / (sines * sines))[:, None]
-    along1, along2 = _dot(d1, between)[:, None], _dot(d2, between)[:, None]
-    s1 = per_sine2 * (cosines * along2 - along1)
-    s2 = per_sine2 * (along2 - cosines * along1)
-    foot1, foot2 = rays1.origins_m + s1 * d1, rays2.origins_m + s2 * d2
-    gaps = foot1 - foot2
+    with np.errstate(all="ignore"):
+        rays1, turn1, shift1 = left.ray_jacobian(left_px)
+        rays2, turn2, shift2 = right.ray_jacobian(right_px)
+        d1, d2, between = rays1.directions, rays2.directions, rays1.origins_m - rays2.origins_m
+        # The common normal's feet o1 + s1 d1 and o2 + s2 d2: the gap between them is perpendicular to both.
+        cosines, normals = _dot(d1, d2)[:, None], crossed(d1, d2)
+        sines = np.sqrt(_dot(normals, normals))
+        per_sine2 = (1.0 / (sines * sines))[:, None]
+        along1, along2 = _dot(d1, between)[:, None], _dot(d2, between)[:, None]
+        s1 = per_sine2 * (cosines * along2 - along1)
+        s2 = per_sine2 * (along2 - cosines * along1)
+        foot1, foot2 = rays1.origins_m + s1 * d1, rays2.origins_m + s2 * d2
+        gaps = foot1 - foot2
 
-    # Derivatives to the four pixel coordinates (left x, y, right x, y): the feet with s1, s2 fixed, then
-    # s1, s2 from d1·gap = d2·gap = 0, which the turned directions disturb as well.
-    d_feet = np.concatenate([shift1 + s1[..., None] * turn1, shift2 + s2[..., None] * turn2], axis=2)
-    d_gap = d_feet * [1.0, 1.0, -1.0, -1.0]
-    r1, r2 = _times(d1, d_gap), _times(d2, d_gap)
-    r1[:, :2] += _times(gaps, turn1)
-    r2[:, 2:] += _times(gaps, turn2)
-    d_s1 = per_sine2 * (cosines * r2 - r1)
-    d_s2 = per_sine2 * (r2 - cosines * r1)
-    d_feet += d1[:, :, None] * d_s1[:, None]
-    d_feet += d2[:, :, None] * d_s2[:, None]
-    d_product = np.concatenate(
-        [
-            _times(normals, shift1) + _times(crossed(d2, between), turn1),
-            _times(crossed(between, d1), turn2) - _times(normals, shift2),
-        ],
-        axis=1,
-    )
-    return _Meeting(
-        np.array([rays1.valid, rays2.valid]),
-        sines,
-        np.concatenate([s1, s2], axis=1),
-        gaps,
-        0.5 * (foot1 + foot2),
-        0.5 * d_feet,
-        d_product / sines[:, None],
-    )
+        # Derivatives to the four pixel coordinates (left x, y, right x, y): the feet with s1, s2 fixed, then
+        # s1, s2 from d1·gap = d2·gap = 0, which the turned directions disturb as well.
+        d_feet = np.concatenate([shift1 + s1[..., None] * turn1, shift2 + s2[..., None] * turn2], axis=2)
+        d_gap = d_feet * [1.0, 1.0, -1.0, -1.0]
+        r1, r2 = _times(d1, d_gap), _times(d2, d_gap)
+        r1[:, :2] += _times(gaps, turn1)
+        r2[:, 2:] += _times(gaps, turn2)
+        d_s1 = per_sine2 * (cosines * r2 - r1)
+        d_s2 = per_sine2 * (r2 - cosines * r1)
+        d_feet += d1[:, :, None] * d_s1[:, None]
+        d_feet += d2[:, :, None] * d_s2[:, None]
+        d_product = np.concatenate(
+            [
+                _times(normals, shift1) + _times(crossed(d2, between), turn1),
+                _times(crossed(between, d1), turn2) - _times(normals, shift2),
+            ],
+            axis=1,
+        )
+        return _Meeting(
+            np.array([rays1.valid, rays2.valid]),
+            sines,
+            np.concatenate([s1, s2], axis=1),
+            gaps,
+            0.5 * (foot1 + foot2),
+            0.5 * d_feet,
+            d_product / sines[:, None],
+        )
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -198,33 +198,33 @@ class OpencvLens:
         return atan(self._folds[0])
 
     @cached_property
-    @np.errstate(all="ignore")
     def _folds(self) -> tuple[float, float]:
         """Slopes sqrt(tau) up to which the lens folds in no direction, and from which on in all."""
-        k1, k2, _, _, k3, k4, k5, k6, *_ = self._numbers
-        above, below = (
-            np.polynomial.Polynomial([1.0, k1, k2, k3]),
-            np.polynomial.Polynomial([1.0, k4, k5, k6]),
-        )
-        y = np.polynomial.Polynomial([0.0, 1.0])
-        growth = (above + 2.0 * y * above.deriv()) * below - 2.0 * y * above * below.deriv()
-        # rho r stops growing, or r has a pole
-        round_fold = float(np.sqrt(min(first_root(tuple(one.coef.tolist())) for one in (growth, below))))
-        if not any((*self._numbers[2:4], *self._numbers[8:])):
-            return round_fold, round_fold
-        steepest = min(1.5 * round_fold, _STEEPEST)
-        rho = np.tan(np.linspace(0.0, atan(steepest), _RADII))
-        around = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False)
-        good = self._upright(np.cos(around)[:, None] * rho, np.sin(around)[:, None] * rho)
-        first = np.where(good.all(axis=1), _RADII, good.argmin(axis=1))
-        if first.min() < 2:
-            return 0.0, 0.0
-        near = float(rho[first.min() - 1])
-        far = float(rho[np.minimum(first, _RADII - 1)].max())
-        if first.max() == _RADII:
-            far = inf if steepest == _STEEPEST else steepest
-        later = good & (np.arange(_RADII) >= first[:, None]) & (rho < far)
-        return (near, near) if later.any() else (near, far)
+        with np.errstate(all="ignore"):
+            k1, k2, _, _, k3, k4, k5, k6, *_ = self._numbers
+            above, below = (
+                np.polynomial.Polynomial([1.0, k1, k2, k3]),
+                np.polynomial.Polynomial([1.0, k4, k5, k6]),
+            )
+            y = np.polynomial.Polynomial([0.0, 1.0])
+            growth = (above + 2.0 * y * above.deriv()) * below - 2.0 * y * above * below.deriv()
+            # rho r stops growing, or r has a pole
+            round_fold = float(np.sqrt(min(first_root(tuple(one.coef.tolist())) for one in (growth, below))))
+            if not any((*self._numbers[2:4], *self._numbers[8:])):
+                return round_fold, round_fold
+            steepest = min(1.5 * round_fold, _STEEPEST)
+            rho = np.tan(np.linspace(0.0, atan(steepest), _RADII))
+            around = np.linspace(0.0, 2.0 * np.pi, _DIRECTIONS, endpoint=False)
+            good = self._upright(np.cos(around)[:, None] * rho, np.sin(around)[:, None] * rho)
+            first = np.where(good.all(axis=1), _RADII, good.argmin(axis=1))
+            if first.min() < 2:
+                return 0.0, 0.0
+            near = float(rho[first.min() - 1])
+            far = float(rho[np.minimum(first, _RADII - 1)].max())
+            if first.max() == _RADII:
+                far = inf if steepest == _STEEPEST else steepest
+            later = good & (np.arange(_RADII) >= first[:, None]) & (rho < far)
+            return (near, near) if later.any() else (near, far)
 
     def _upright(self, x: FloatArray, y: FloatArray) -> np.ndarray:
         """Where the picture is not turned inside out."""
@@ -257,15 +257,15 @@ class OpencvLens:
         ]
 
     @cached_property
-    @np.errstate(all="ignore")
     def _farthest(self) -> float:
         """The largest distorted slope that may be reached."""
-        if not self._folds[1] < inf:
-            return inf
-        around = np.linspace(0.0, 2.0 * np.pi, 4 * _DIRECTIONS)
-        edges = [self._flat(rho * np.cos(around), rho * np.sin(around))[:2] for rho in self._folds]
-        largest = 1.002 * max(float(np.hypot(*edge).max()) for edge in edges)
-        return largest if isfinite(largest) else inf
+        with np.errstate(all="ignore"):
+            if not self._folds[1] < inf:
+                return inf
+            around = np.linspace(0.0, 2.0 * np.pi, 4 * _DIRECTIONS)
+            edges = [self._flat(rho * np.cos(around), rho * np.sin(around))[:2] for rho in self._folds]
+            largest = 1.002 * max(float(np.hypot(*edge).max()) for edge in edges)
+            return largest if isfinite(largest) else inf
 
     def _undistorted(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray, np.ndarray]:
         """Undistorted slopes of distorted ones, and which exist."""

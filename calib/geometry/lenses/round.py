@@ -223,15 +223,15 @@ class RoundLens:
         return inf if chi == inf else chi * float(polynomial(self._values, np.array(chi * chi)))
 
     @cached_property
-    @np.errstate(all="ignore")
     def entrance(self) -> Entrance:
         """The entrance point that moves."""
-        limit_rad = self.limit_rad
-        image_rad = limit_rad
-        if self.image_slope < self._distorted_limit:
-            (k,) = self._shrink(np.array([self.image_slope**2]))
-            image_rad = self._theta_of(k * self.image_slope)
-        return Entrance(self.e, image_rad, limit_rad)
+        with np.errstate(all="ignore"):
+            limit_rad = self.limit_rad
+            image_rad = limit_rad
+            if self.image_slope < self._distorted_limit:
+                (k,) = self._shrink(np.array([self.image_slope**2]))
+                image_rad = self._theta_of(k * self.image_slope)
+            return Entrance(self.e, image_rad, limit_rad)
 
     def _theta_of(self, chi: float) -> float:
         """Angle of slope ``chi``, at most what the linearity and half a turn allow."""
