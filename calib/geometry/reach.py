@@ -131,11 +131,12 @@ class Arm:
         def reached(distance: float) -> bool:
             return any(True for _ in self.points(distance, z))
 
-        inside, outside = rho, max(2.0 * rho, 1e-3 * math.hypot(rho, z))
+        size = math.hypot(rho, z, self.a)
+        inside, outside = rho, max(2.0 * rho, 1e-3 * size)
         while not reached(outside):
             inside, outside = outside, 2.0 * outside
             # So far from the target's distance there is no edge of reach.
-            if outside > 1e4 * math.hypot(rho, z):
+            if outside > 1e4 * size:
                 return None
         while outside - inside > 1e-12 * outside:
             middle = 0.5 * (inside + outside)

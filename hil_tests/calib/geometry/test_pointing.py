@@ -291,6 +291,17 @@ def test_blind_cone_says_how_far_inside_the_target_is() -> None:
     )
 
 
+def test_target_at_the_origin_of_a_mast_with_an_offset_is_refused() -> None:
+    # The search for the edge of reach began at this distance of 0 and never grew.
+    with pytest.raises(Unreachable, match=r"target is 0 m from the pan axis .* inside the blind cone by"):
+        solve(
+            Mast(np.zeros(3), np.zeros(3), axis_offset_m=0.05),
+            pinhole(np.zeros(3)),
+            [0.0, 0.0, 0.0],
+            [600.0, 500.0],
+        )
+
+
 def nearest_to_the_pan_axis_m(
     mast: Mast, origin: np.ndarray, direction: np.ndarray, height_m: float
 ) -> float:
