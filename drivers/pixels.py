@@ -162,12 +162,7 @@ def jpeg_of(format: PictureFormat, raw: NDArray[np.uint8]) -> bytes:
 def grey(format: PictureFormat, raw: NDArray[np.uint8]) -> Image:
     """Return the grey picture, uint8 (h, w), in memory of its own. Raises BadFrame for a broken JPEG.
 
-    Parameters
-    ----------
-    format
-        As the driver set it; its code must be among `FORMATS` or `GENICAM`.
-    raw
-        The bytes of one picture, uint8 (n,).
+    The code must be among `FORMATS` or `GENICAM`; ``raw`` are the bytes of one picture, uint8 (n,).
     """
     layout = _LAYOUTS[format.code]
     if layout.kind == "jpeg":

@@ -49,14 +49,9 @@ MOST_BOW_M = 0.05
 
 @dataclass(frozen=True, eq=False)
 class BenchBoard:
-    """A board where it is.
+    """A board where it is: origin in its middle, x right, y down, z into the board.
 
-    Attributes
-    ----------
-    site_from_board
-        The board's frame (origin in its middle, x right, y down, z into the board) in the site frame.
-    bow_m
-        How far its middle stands out, across and down (`calib.targets.boards`).
+    By ``bow_m`` its middle stands out, across and down (`calib.targets.boards`).
     """
 
     board: AnyBoard
@@ -179,19 +174,19 @@ class BenchBoards:
         # within a pixel the way from image to board is straight to a millionth of the board's cells
         by_row, by_column = (np.gradient(grid, axis=axis).reshape(-1, 2) for axis in (0, 1))
         front = directions[:, 2] > 0.0
-        few = self._looked(board, hits, by_column, by_row, front, RIM)
+        few = self._sampled(board, hits, by_column, by_row, front, RIM)
         seen = few[0] + 1000.0 * few[1]
         busy = np.flatnonzero(_uneven(seen.reshape(*shape, len(RIM))))
         value, covered = few[..., 0].copy()
         for k in range(0, len(busy), RAYS_AT_ONCE // RAYS):
             some = busy[k : k + RAYS_AT_ONCE // RAYS]
-            many = self._looked(board, hits[some], by_column[some], by_row[some], front[some], WITHIN)
+            many = self._sampled(board, hits[some], by_column[some], by_row[some], front[some], WITHIN)
             value[some], covered[some] = many.mean(axis=-1)
         under = image[box]
         under[...] = under * (1.0 - covered.reshape(shape)) + value.reshape(shape)
 
     @staticmethod
-    def _looked(
+    def _sampled(
         board: BenchBoard,
         hits: Float64,
         by_column: Float64,
@@ -230,15 +225,10 @@ def facing(camera_m: ArrayLike, position_m: ArrayLike, turned_rad: ArrayLike = (
     """Return frame_from_board of a board at a place, upright and square to a camera, then turned about
     itself.
 
-    Raises BadOptions if the board would be right over or under the camera, where nothing is upright.
+    Both places are (3,) metres in a frame whose z is down. It is turned about its own x (its upper edge comes
+    nearer), y (its right edge comes nearer) and z (it turns to the right, as seen from the camera), z first.
 
-    Parameters
-    ----------
-    camera_m, position_m
-        (3,) metres in a frame whose z is down.
-    turned_rad
-        About the board's own x (its upper edge comes nearer), y (its right edge comes nearer) and z (it turns
-        to the right, as seen from the camera), z first.
+    Raises BadOptions if the board would be right over or under the camera, where nothing is upright.
     """
     away = np.asarray(position_m, dtype=np.float64) - np.asarray(camera_m, dtype=np.float64)
     right = np.cross([0.0, 0.0, 1.0], away)

@@ -37,7 +37,7 @@ SHORTEST_S, LONGEST_SHARE = 1e-5, 0.99
 
 GAINS = 1.0, 64.0
 
-LOOKED_AGAIN_S = 0.5
+CHECKED_AGAIN_S = 0.5
 """For a clock that is turned by hand: it wakes no thread."""
 
 
@@ -69,17 +69,10 @@ class SimulatedCamera(Camera):
     Each call may hang by a fault. It returns when that is over, also when the camera was closed meanwhile, as
     a driver that waits for its kernel does.
 
-    Parameters
-    ----------
-    expose
-        ``expose(begin_s, exposure_s)`` gives the noise-free float32 (h, w) picture of an exposure, whose
-        first row begins then; one that it keeps is read-only.
-    taken
-        ``taken(sequence, mid_exposure_s)`` is called with every frame that is handed out, before it is.
-    start_s
-        When the exposure of frame 0 begins: one value for all cameras of a rover.
-    metered
-        ``metered(time_s)``: a coarse noise-free picture of the moment, for an automatic exposure.
+    ``expose(begin_s, exposure_s)`` gives the noise-free picture (h, w) of an exposure whose first row begins
+    then; one that it keeps is read-only. ``taken(sequence, mid_exposure_s)`` is called with every frame
+    before it is handed out. ``metered(time_s)`` gives a coarse noise-free picture for an automatic exposure.
+    All cameras of a rover have one ``start_s``, when the exposure of frame 0 begins.
     """
 
     def __init__(
@@ -220,7 +213,7 @@ class SimulatedCamera(Camera):
                 if fault is None or fault.number("call") not in (ANY, call):
                     return
                 # Idle: that a call hangs makes no time pass where no other thread waits.
-                self._changed.wait(min(LOOKED_AGAIN_S, fault.end_s - now_s), idle=True)
+                self._changed.wait(min(CHECKED_AGAIN_S, fault.end_s - now_s), idle=True)
 
     def _wake(self) -> None:
         with self._changed:

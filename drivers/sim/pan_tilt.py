@@ -245,14 +245,8 @@ class SimulatedPanTilt(PanTilt):
 class WiredHead:
     """Axes, the simulator that turns them, the line to it, and the real driver at its other end.
 
-    Raises BadOptions for a head or clock that this cannot be done with; DriverError.
-
-    Parameters
-    ----------
-    head
-        What it is made of; its approach is done by the driver.
-    clock
-        What simulator, line and driver live on: the machine's own or the simulation's, none turned by hand.
+    The head's approach is done by the driver. Raises BadOptions for a head that has no such wire, and for a
+    clock turned by hand; DriverError.
     """
 
     def __init__(self, wire: str, head: HeadModel, clock: Clock, faults: FaultPanel) -> None:

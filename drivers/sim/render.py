@@ -145,12 +145,7 @@ def beams(rays: Float32, starts: Float32, samples: int, size_px: int) -> Float64
 class Renderer:
     """Draws one scene; may be called from several threads.
 
-    Parameters
-    ----------
-    scene
-        What ``build_scene`` returned.
-    workers
-        Threads that share the work of a picture; the machine's processors by default.
+    So many ``workers`` share the work of a picture; the machine's processors by default.
     """
 
     def __init__(self, scene: Scene, workers: int | None = None) -> None:
@@ -168,27 +163,16 @@ class Renderer:
         samples: int = 2,
         rows: tuple[int, int] | None = None,
     ) -> Float32:
-        """Return the picture that ``camera`` takes of the scene.
+        """Return the picture (h, w) that ``camera`` takes of the scene: brightness 0 to 255, noise-free.
+
+        The model is in the frame it is mounted in (head or rover). Its rays are computed once and kept, so
+        give the same model with another transform for another pose, not a moved model. C must be above the
+        ground, and within 32 m of the site's origin in x and y. Each pixel is the mean of samples x samples
+        rays, 1 to 8 across. Of rows outside [first, last) some are 0. Pixels for which the model has no ray
+        are 0, and so are those whose ray starts under the ground (in CAHVORE rays start the farther from C
+        the more they bend).
 
         Raises BadOptions if ``samples`` is out of bounds, or the camera stands where it sees nothing.
-
-        Parameters
-        ----------
-        camera
-            The model in the frame it is mounted in (head or rover). Its rays are computed once and kept, so
-            give the same model with another transform for another pose, not a moved model.
-        site_from_camera_frame
-            Where that frame is. C must be above the ground, and within 32 m of the site's origin in x and y.
-        samples
-            Rays across a pixel, 1 to 8: each pixel is the mean of samples x samples rays.
-        rows
-            [first, last): what is wanted; of the other rows some are 0.
-
-        Returns
-        -------
-        image : (h, w) float32
-            Brightness, 0 to 255, noise-free. Pixels for which the model has no ray are 0, and so are those
-            whose ray starts under the ground (in CAHVORE rays start the farther from C the more they bend).
         """
         if not 1 <= samples <= MAX_SAMPLES:
             raise BadOptions(f"{samples} samples across a pixel where 1 to {MAX_SAMPLES} are possible")

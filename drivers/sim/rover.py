@@ -129,7 +129,7 @@ class RoverModel:
             wired = WiredHead(settings.wire, axes, clock, self.faults)
             self.pan_tilt, self._head = wired.pan_tilt, wired
         start_s = self._start_s = clock.now_s()
-        self._right_eyes = {right for _, right in self.rig.stereo.values()}
+        self._right_cameras = {right for _, right in self.rig.stereo.values()}
         self._lenses = {
             name: SimulatedLens(settings.camera.lens, camera.model, name, settings.camera.seed, self._cast)
             for name, camera in self.rig.cameras.items()
@@ -163,17 +163,10 @@ class RoverModel:
     def stand(
         self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
     ) -> Rigid:
-        """Put the rover somewhere on the ground, at once, and return site_from_rover.
+        """Put the rover's origin on the ground at (x, y) of the site frame, at once; return site_from_rover.
 
-        Raises BadOptions (farther than ``REACH_M`` from the middle of the ground, or for an angle that is no
-        number).
-
-        Parameters
-        ----------
-        x_m, y_m
-            In the site frame; the rover's origin comes to lie on the ground there.
-        heading_rad, pitch_rad, roll_rad
-            As `Scene.standing` takes them.
+        The angles are those of `Scene.standing`. Raises BadOptions farther than ``REACH_M`` from the middle
+        of the ground, or for an angle that is no number.
         """
         for name, angle in (("heading", heading_rad), ("pitch", pitch_rad), ("roll", roll_rad)):
             if not math.isfinite(angle):
@@ -202,21 +195,13 @@ class RoverModel:
     ) -> BenchBoard:
         """Have a board stand somewhere from the next picture on, and return it.
 
+        The position (3,) of its middle is in the rover frame as the rover stands now. It is turned after
+        facing the mast upright (`bench_boards.facing`), or ``rotation`` (3, 3) is rover_from_board. None for
+        ``board``: the one of this name that is there already; for ``bow_m`` (across, down): as before, flat
+        at first.
+
         Raises BadOptions for a board that is not there and was not given, a place off the ground, or too much
         of a bow.
-
-        Parameters
-        ----------
-        board
-            What is printed on it; None for the board of this name that is there already.
-        position_m
-            (3,) of its middle, in the rover frame as the rover stands now.
-        turned_rad
-            How it is turned about its x, y and z after facing the mast upright (`bench_boards.facing`).
-        rotation
-            (3, 3) rover_from_board instead of that.
-        bow_m
-            How far its middle stands out (across, down); None: as before, flat at first.
         """
         before = self.boards.get(name)
         if board is None and before is None:
@@ -231,7 +216,7 @@ class RoverModel:
         assert printed is not None
         stands = checked(name, BenchBoard(printed, self.site_from_rover @ rover_from_board, bow), self.boards)
         self._boards.put(name, stands)
-        self._look_again()
+        self._forget_pictures()
         return stands
 
     def take_board(self, name: str) -> None:
@@ -239,9 +224,9 @@ class RoverModel:
         if name not in self.boards:
             raise BadOptions(f"there is no board {name!r}{nearest(name, self.boards)}")
         self._boards.put(name, None)
-        self._look_again()
+        self._forget_pictures()
 
-    def _look_again(self) -> None:
+    def _forget_pictures(self) -> None:
         """Forget pictures of what stood there before."""
         self._stills = Stills(self._boards.image)
         self._metered_at.clear()
@@ -405,7 +390,7 @@ class RoverModel:
     def _model(self, name: str, time_s: float) -> CameraModel:
         """The camera in its mounting frame, as warm as it is at a moment."""
         day, model = self.settings.temperature, self.rig.cameras[name].model
-        return day.camera(model, name in self._right_eyes, self._warmer_k(time_s))
+        return day.camera(model, name in self._right_cameras, self._warmer_k(time_s))
 
     def _rover_from_frame(self, name: str, time_s: float) -> Rigid:
         """Where a camera's mounting frame is at a moment."""

@@ -84,20 +84,10 @@ class Scene:
     def cast(self, origins_m: ArrayLike, directions: ArrayLike) -> Float64:
         """Return how far rays go before they meet the ground or a rock.
 
-        The geometry is the one the pictures are made of, in float64.
-
-        Parameters
-        ----------
-        origins_m
-            (..., 3) in the site frame, metres; above the ground and within 32 m of the origin in x and in y.
-        directions
-            (..., 3), any length but zero; shapes broadcast against ``origins_m``.
-
-        Returns
-        -------
-        ranges_m : (...,)
-            Metres along the ray; not-a-number for the sky, for a start under the ground or outside the
-            inner grid, and for rays that are not finite.
+        The geometry is the one the pictures are made of, in float64. Origins (..., 3) are in the site frame,
+        above the ground and within 32 m of the origin in x and in y; directions (..., 3) have any length but
+        zero; their shapes broadcast. Ranges (...,) are metres along the ray: not-a-number for the sky, for a
+        start under the ground or outside the inner grid, and for rays that are not finite.
         """
         origins, wanted = np.broadcast_arrays(
             np.asarray(origins_m, dtype=np.float64), np.asarray(directions, dtype=np.float64)

@@ -96,10 +96,6 @@ class SimulatedLens:
             light = defocused(light, self.discs_px(pose))
         return light * self.transmission
 
-    @property
-    def _focal_px(self) -> float:
-        return self.camera.focal_px[0]
-
     def discs_px(self, pose: Rigid) -> Float32:
         """Return (h, w) the diameter of the disc that a point of each pixel's range makes, pixels."""
         s = self.settings
@@ -108,7 +104,7 @@ class SimulatedLens:
         rays = self.camera.ray(pixels_of(x_px, y_px))
         ranges_m = self.ranges(pose.points(rays.origins_m), pose.vectors(rays.directions))
         depth_m = np.where(np.isfinite(ranges_m), ranges_m * (rays.directions @ self.camera.A), FAR_M)
-        focal_m = self._focal_px * s.pitch_um * 1e-6
+        focal_m = self.camera.focal_px[0] * s.pitch_um * 1e-6
         focus_m = s.focus_m or FAR_M
         aperture_m = focal_m / s.f_number
         disc_m = aperture_m * focal_m * np.abs(depth_m - focus_m) / (np.abs(depth_m) * (focus_m - focal_m))

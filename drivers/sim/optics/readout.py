@@ -30,13 +30,7 @@ def bell() -> Float32:
 
 @dataclass(frozen=True)
 class Noise:
-    """The noise of one camera.
-
-    Attributes
-    ----------
-    seed
-        With ``camera`` and a frame's sequence number it fixes every pixel.
-    """
+    """The noise of one camera; seed, camera and a frame's sequence number fix every pixel."""
 
     read_dn: float
     shot_dn: float
@@ -64,16 +58,10 @@ class Noise:
 
 @dataclass(frozen=True)
 class Readout:
-    """How one camera reads its sensor.
+    """How one camera reads its sensor: with its noise at gain 1.
 
-    Attributes
-    ----------
-    noise
-        At gain 1.
-    colour
-        Whether its pixels lie under red, green and blue filters (RGGB), and its pictures are (h, w, 3) BGR.
-    jpeg_quality
-        Of the frames as they come, 1 to 100; 0: they come as they are.
+    With ``colour`` its pixels lie under red, green and blue filters (RGGB), and its pictures are (h, w, 3)
+    BGR.
     """
 
     noise: Noise

@@ -10,7 +10,7 @@ by the key's camera. What that leaves out is the change of perspective within ha
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import cv2
@@ -47,18 +47,11 @@ class KeyView(NamedTuple):
 
 @dataclass(frozen=True)
 class Shutter:
-    """One camera's shutter.
+    """One camera's shutter; with a ``row_time_s`` of 0 all rows are exposed at once.
 
-    Attributes
-    ----------
-    row_time_s
-        From the exposure of one row to that of the next; 0: all rows at once.
-    pose
-        ``pose(time_s)``: site_from_mounting_frame.
-    draw
-        ``draw(camera, pose, samples, rows)``: the light of a view at least in rows [first, last).
-    ranges
-        ``ranges(origins_m, directions)``: how far rays go in the site frame, metres, nan for sky.
+    ``pose(time_s)`` is site_from_mounting_frame. ``draw(camera, pose, samples, rows)`` returns the light of a
+    view at least in rows [first, last). ``ranges(origins_m, directions)`` is how far rays go in the site
+    frame, metres, not-a-number for sky.
     """
 
     camera: CameraModel
@@ -75,12 +68,8 @@ class Shutter:
     def light(self, begin_s: float, exposure_s: float, samples: int) -> Float32 | None:
         """Return the mean light (h, w) of each row's exposure; None if nothing moves that could be seen.
 
-        Parameters
-        ----------
-        begin_s, exposure_s
-            When the first row's exposure begins, and how long each row's lasts.
-        samples
-            Rays along a pixel's side, of the key views.
+        The first row's exposure begins at ``begin_s``, each row's lasts ``exposure_s``; the key views have
+        ``samples`` rays along a pixel's side.
         """
         times_s, way_px = self._way(begin_s, self.rolling_s + exposure_s)
         if way_px[-1] < STILL_PX:
@@ -146,41 +135,38 @@ class Shutter:
         return np.asarray(np.where(np.isfinite(places), places, pixels) + margin)
 
 
+@dataclass
 class _Keys:
     """The key views of one picture, drawn when first requested."""
 
-    def __init__(
-        self,
-        shutter: Shutter,
-        times_s: Float64,
-        way_px: Float64,
-        row_begin_s: Float64,
-        exposure_s: float,
-        samples: int,
-    ) -> None:
-        self._shutter = shutter
-        self._times_s, self._way_px = times_s, way_px
-        self._row_begin_s, self._exposure_s = row_begin_s, exposure_s
-        self._steps = max(1, int(np.ceil(way_px[-1] / KEY_STEP_PX)))
-        self._samples = samples
-        self._camera = widened(shutter.camera)
-        self._drawn: dict[int, KeyView] = {}
+    shutter: Shutter
+    times_s: Float64
+    way_px: Float64
+    row_begin_s: Float64
+    exposure_s: float
+    samples: int
+    drawn: dict[int, KeyView] = field(default_factory=dict)
+
+    @property
+    def steps(self) -> int:
+        """From the first key to the last."""
+        return max(1, int(np.ceil(self.way_px[-1] / KEY_STEP_PX)))
 
     def owners(self, times_s: Float64) -> NDArray[np.int64]:
         """Return the number of the nearest key for moments."""
-        parts = np.interp(times_s, self._times_s, self._way_px) / self._way_px[-1]
-        return np.asarray(np.rint(parts * self._steps).astype(np.int64))
+        parts = np.interp(times_s, self.times_s, self.way_px) / self.way_px[-1]
+        return np.asarray(np.rint(parts * self.steps).astype(np.int64))
 
     def __getitem__(self, number: int) -> KeyView:
-        if number not in self._drawn:
-            along = number / self._steps * self._way_px[-1]
-            pose = self._shutter.pose(float(np.interp(along, self._way_px, self._times_s)))
-            ends = [self.owners(self._row_begin_s + part * self._exposure_s) for part in (0.0, 1.0)]
+        if number not in self.drawn:
+            along = number / self.steps * self.way_px[-1]
+            pose = self.shutter.pose(float(np.interp(along, self.way_px, self.times_s)))
+            ends = [self.owners(self.row_begin_s + part * self.exposure_s) for part in (0.0, 1.0)]
             rows = np.flatnonzero((ends[0] <= number) & (number <= ends[1]))
             first, last = int(rows[0]), int(rows[-1]) + 1 + 2 * MARGIN_PX
-            image = self._shutter.draw(self._camera, pose, self._samples, (first, last))
-            self._drawn[number] = KeyView(pose, first, np.ascontiguousarray(image[first:last]))
-        return self._drawn[number]
+            image = self.shutter.draw(widened(self.shutter.camera), pose, self.samples, (first, last))
+            self.drawn[number] = KeyView(pose, first, np.ascontiguousarray(image[first:last]))
+        return self.drawn[number]
 
 
 def widened(camera: CameraModel) -> CameraModel:
