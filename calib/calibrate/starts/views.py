@@ -8,6 +8,7 @@ Bartoli 2014), both of its solutions where a small or distant board looks nearly
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import cv2
@@ -112,7 +113,8 @@ def _focal_of_homographies(images: Sequence[ImageTerm], size_px: tuple[int, int]
     for term in images:
         points = term.in_board_m[term.keep].astype(np.float32)
         pixels = term.pixels_px[term.keep].astype(np.float32)
-        found.append(cv2.initCameraMatrix2D([points], [pixels], size_px)[0, 0])
+        with suppress(cv2.error):  # all of its corners may be on one line: it has no homography
+            found.append(cv2.initCameraMatrix2D([points], [pixels], size_px)[0, 0])
     good = [f for f in found if np.isfinite(f) and 0.1 < f / max(size_px) < 20.0]
     return float(np.median(good)) if good else None
 

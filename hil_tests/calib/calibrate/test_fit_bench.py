@@ -6,6 +6,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -21,6 +22,7 @@ from calib.adjust.unknowns import ResidualBlock
 from calib.calibrate.bench.fit import fit_bench
 from calib.calibrate.bench.problem import BenchOptions, BenchProblem
 from calib.calibrate.starts.bench import BenchNotFitted
+from calib.calibrate.starts.views import view_poses
 from calib.geometry.rig import Mast
 from calib.geometry.rigid import Rigid
 from calib.geometry.significance import chance
@@ -346,6 +348,24 @@ def test_check_images_of_a_camera_share_the_error_of_its_calibration() -> None:
     np.testing.assert_allclose(
         np.sort(check_weights(problem, state, np.array([[0.25]]), terms)), expected, atol=1e-6
     )
+
+
+def test_an_image_of_one_row_of_corners_fixes_nothing_and_harms_nothing() -> None:
+    rows, columns = np.divmod(np.arange(40), 8)
+    points = np.stack([columns, rows, 0 * rows], axis=-1) * 0.035
+    lens = np.array([[1000.0, 0.0, 511.5], [0.0, 1000.0, 383.5], [0.0, 0.0, 1.0]])
+    terms = []
+    for k, turn in enumerate(([0.4, 0.0, 0.0], [0.0, 0.4, 0.1], [-0.3, 0.3, 0.0], [0.2, -0.4, 0.0])):
+        some = rows == 0 if k == 2 else rows >= 0
+        pixels = cv2.projectPoints(points, np.array(turn), np.array([-0.1, -0.05, 0.7]), lens, None)[0]
+        terms.append(
+            ImageTerm(
+                str(k), "left", ("b", "p"), None, 0.0, 0.0, rows[some], columns[some], points[some],
+                pixels[some, 0], np.full(some.sum(), 0.1), np.ones(some.sum(), dtype=bool),
+            )
+        )  # fmt: skip
+    views = view_poses(terms, "CAHV", (1024, 768), None)
+    assert np.linalg.norm(np.cross(views.model.A, views.model.H)) == pytest.approx(1000.0, rel=0.01)
 
 
 def test_corners_far_beyond_what_the_folder_allows_are_refused() -> None:
