@@ -259,7 +259,7 @@ def _ordered(words: Sequence[str]) -> tuple[list[str], str]:
         place += rest[:size]
         rest = rest[size:]
     if not rest:
-        return [*options, *url], ""
+        return options, ""
     if len([word for word in (*url, *rest) if word == "--url" or word.startswith("--url=")]) > 1:
         raise output.WrongUse("--url is there twice; one address is expected")
     command = rest.pop(0)

@@ -112,6 +112,10 @@ def serve_config(config: Config, args: argparse.Namespace) -> None:
     example="--wait 30",
 )
 def _status(args: argparse.Namespace) -> Answer | int:
+    if args.events is None and (args.key or args.count is not None):
+        raise WrongUse("--key and --count go with --events")
+    if args.wait is not None and (args.operations or args.events is not None):
+        raise WrongUse("--wait goes with the status alone or with --operation")
     with client_of(args) as client:
         if args.events is not None:
             return _events(args, client)

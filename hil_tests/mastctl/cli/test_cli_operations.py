@@ -67,6 +67,22 @@ def test_events_are_a_line_each(pair: BOTH, operation: str, capsys: pytest.Captu
     assert "'weather' where some of" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("status --count 3", "--key and --count go with --events"),
+        ("status --key left", "--key and --count go with --events"),
+        ("status --operations --wait 5", "--wait goes with the status alone or with --operation"),
+        ("--url http://127.0.0.1:1", "the following arguments are required: COMMAND"),
+    ],
+)
+def test_options_of_another_use_are_refused(
+    words: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words.split()) == 2
+    assert message in capsys.readouterr().err
+
+
 def test_the_mast_file_is_shown_replaced_and_put_back(
     pair: BOTH, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
