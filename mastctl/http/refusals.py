@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from functools import cache
 from typing import Annotated, Any, TypeVar
 
@@ -215,5 +215,9 @@ def _of_parameter(error: Mapping[str, Any], facts: FieldInfo) -> str:
     if error["type"] == "string_pattern_mismatch":
         return f"{name}: {kind_of(error['input'])} where {facts.description} is expected"
     schema = schema_of(Annotated[facts.annotation, facts], "")
-    ((place, reason),) = mistakes_in([{**error, "loc": ()}], schema, name)
+    given = error["input"]
+    if isinstance(given, str) and not error["type"].startswith("string"):
+        with suppress(ValueError):  # the number that a header's text is, if it is one
+            given = float(given)
+    ((place, reason),) = mistakes_in([{**error, "loc": (), "input": given}], schema, name)
     return f"{place}: {reason}"
