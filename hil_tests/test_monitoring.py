@@ -211,7 +211,7 @@ def test_a_recording_has_every_topic_and_field_of_the_layout(layout: dict[str, A
         }
         assert len(ids) == 1 and ids <= frames
     words = {rule["rawValue"] for rule in layout["configById"]["Indicator!state"]["rules"]}
-    assert {message["word"] for message in messages["/state"]} <= words | {"starting", "closing"}
+    assert {message["state"] for message in messages["/state"]} <= words | {"starting", "closing"}
 
 
 def found(message: Any, fields: list[str]) -> bool:

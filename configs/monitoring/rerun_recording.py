@@ -43,9 +43,8 @@ def residual(value: Mapping[str, Any]) -> None:
 
 def state(value: Mapping[str, Any]) -> None:
     """The state and its reason."""
-    rr.log(
-        "log/state", rr.TextLog(f"{value['word']}: {value['reason']}", level=LEVEL.get(value["word"], "INFO"))
-    )
+    level = LEVEL.get(value["state"], "INFO")
+    rr.log("log/state", rr.TextLog(f"{value['state']}: {value['reason']}", level=level))
 
 
 def fault(value: Mapping[str, Any]) -> None:
