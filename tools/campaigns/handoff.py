@@ -247,7 +247,7 @@ class Stage:
             low = self.usual.model_copy(update={"rocks": 300, "bricks": 12, "sun_elevation_rad": 0.45})
             by = float(rng.uniform(0.15, 0.7) * rng.choice([-1.0, 1.0]))
             contrast = float(rng.choice([1.0, 0.3, 0.1]))
-            suns = (low, replace(low, sun_azimuth_rad=low.sun_azimuth_rad + by))
+            suns = (low, low.model_copy(update={"sun_azimuth_rad": low.sun_azimuth_rad + by}))
             before, after = (faded(scene_of(one), contrast, broad=False) for one in suns)
             return ProvokedView(before, after)
         elif self.kind == "range":
