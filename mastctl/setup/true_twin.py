@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy.linalg import block_diag
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.covariance import RigCovariance, moved_rig, stored_covariance
-from calib.geometry.parameters import focus_and_turn_rates, parameter_names, parameter_part
+from calib.geometry.parameters import parameter_names, parameter_part
 from calib.geometry.rig import JointErrors, Rig
-from calib.geometry.rigid import FloatArray
+from calib.geometry.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z, tangents
 from mastctl.setup.new_rig import BadRig
 
 # LEFT_...: what a survey leaves open, one sigma. Mast: four prisms half a metre apart, 1 mm each. Cameras: so
@@ -31,6 +31,7 @@ STATED = (
     f"R1 {LEFT_BENDS[0]:g}, R2 {LEFT_BENDS[1]:g} (one sigma, independent)"
 )
 
+_SMALL = 1e-6  # of a sigma: steps of the differences that turn these into a camera's own parameters
 GRID = 9
 
 
@@ -92,18 +93,57 @@ def usual_covariance(rig: Rig) -> RigCovariance:
 
 
 def _rates(model: CameraModel) -> FloatArray:
-    """The step of a fit (p,) by each usual error of one sigma: (p, 11), for a CAHV camera (p, 9)."""
-    rows = np.eye(len(parameter_names(model.kind)))
-    part = partial(parameter_part, model.kind)
-    columns = [
-        LEFT_PLACE_M * rows[:, part("C")],
-        focus_and_turn_rates(model) * [LEFT_FOCAL, *[LEFT_ANGLE_RAD] * 3],
-        *(LEFT_MIDDLE_PX * rows[:, part(letter)] @ model.A[:, None] for letter in "HV"),
+    """How the parameters of a fit (p,) go with each usual error, (p, n), for errors of one sigma."""
+    errors = _errors(model)
+    return np.column_stack(
+        [(_step(model, error(_SMALL)) - _step(model, error(-_SMALL))) / (2 * _SMALL) for error in errors]
+    )
+
+
+def _errors(model: CameraModel) -> list[Callable[[float], CameraModel]]:
+    """One function a usual error: the camera with so many sigmas of it."""
+
+    def shifted(axis: int) -> Callable[[float], CameraModel]:
+        return lambda t: model.moved(Rigid(np.eye(3), t * LEFT_PLACE_M * np.eye(3)[axis]))
+
+    def turned(turn: Callable[[float], FloatArray]) -> Callable[[float], CameraModel]:
+        def error(t: float) -> CameraModel:
+            rotation = turn(t * LEFT_ANGLE_RAD)
+            return model.moved(Rigid(rotation, model.C - rotation @ model.C))
+
+        return error
+
+    def zoomed(t: float) -> CameraModel:
+        h, v = (part + t * LEFT_FOCAL * (part - (part @ model.A) * model.A) for part in (model.H, model.V))
+        return replace(model, H=h, V=v)
+
+    def bent(place: int) -> Callable[[float], CameraModel]:
+        return lambda t: model.bent(place, t * LEFT_BENDS[place])
+
+    found = [shifted(axis) for axis in range(3)] + [turned(turn) for turn in (rot_x, rot_y, rot_z)] + [zoomed]
+    found += [
+        lambda t: replace(model, H=model.H + t * LEFT_MIDDLE_PX * model.A),
+        lambda t: replace(model, V=model.V + t * LEFT_MIDDLE_PX * model.A),
     ]
     if model.kind != "CAHV":
-        lens = part("D" if "D" in model.letters else "R").start
-        columns.append(rows[:, lens : lens + 2] * LEFT_BENDS)
-    return np.hstack(columns)
+        found += [bent(0), bent(1)]
+    return found
+
+
+def _step(model: CameraModel, other: CameraModel) -> FloatArray:
+    """The step of a fit from one camera to another near it, to first order."""
+    parts = {
+        letter: getattr(other, letter) - getattr(model, letter) for letter in model.letters if letter != "D"
+    }
+    parts["A"] = tangents(model.A) @ parts["A"]
+    if "O" in parts:
+        parts["O"], parts["R"] = tangents(model.O) @ parts["O"], parts["R"][1:]
+    if "D" in model.letters:
+        parts["D"] = other.distortion - model.distortion
+    step = np.zeros(len(parameter_names(model.kind)))
+    for letter, part in parts.items():
+        step[parameter_part(model.kind, letter)] = part
+    return step
 
 
 def _apart_px(believed: Rig, true_rig: Rig, name: str) -> float:
