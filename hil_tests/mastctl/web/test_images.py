@@ -115,9 +115,10 @@ def test_a_camera_that_fails_holds_no_other_up_and_comes_back(
 
 def test_a_camera_without_viewers_takes_no_picture(pair: BOTH) -> None:
     daemon, hardware = pair
-    with watching(daemon.url, LEFT) as line:
-        received(line)
-    asked = len(hardware.fake_cameras[LEFT].asked)
+    for camera in (LEFT, RIGHT):
+        with watching(daemon.url, camera) as line:
+            received(line)
+    asked = len(hardware.fake_cameras[LEFT].asked)  # with one that was under way when its viewer left
     with watching(daemon.url, RIGHT) as line:
         received(line)
     assert len(hardware.fake_cameras[LEFT].asked) == asked
