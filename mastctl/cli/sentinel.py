@@ -48,7 +48,7 @@ def _steering(args: argparse.Namespace, client: Client) -> Iterator[None]:
 )
 def _reference(args: argparse.Namespace) -> Answer:
     from mastctl.watch.looks import head_cameras, now_utc, take_pictures, usual_rests
-    from mastctl.watch.reference import save_reference
+    from mastctl.watch.sentinel import save_reference
 
     with client_of(args) as client, _steering(args, client):
         rests = args.pose or usual_rests(client)
@@ -77,7 +77,7 @@ def _reference(args: argparse.Namespace) -> Answer:
 )
 def _look(args: argparse.Namespace) -> Answer:
     from mastctl.watch.looks import look_again, now_utc
-    from mastctl.watch.reference import add_look, read_reference
+    from mastctl.watch.sentinel import add_look, read_reference
 
     reference = read_reference(args.folder)
     with (
@@ -91,8 +91,7 @@ def _look(args: argparse.Namespace) -> Answer:
 
 def _standing(args: argparse.Namespace, look: dict[str, Any] | None) -> Answer:
     from mastctl.watch.looks import now_utc
-    from mastctl.watch.reference import read_looks, read_reference
-    from mastctl.watch.sentinel import standing
+    from mastctl.watch.sentinel import read_looks, read_reference, standing
 
     reference = read_reference(args.folder)
     now = standing(reference, read_looks(args.folder, reference), now_utc())

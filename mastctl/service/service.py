@@ -67,9 +67,8 @@ from mastctl.service_manager import ServiceManager
 from mastctl.watch.handoffs import HandoffCheck, line_of
 from mastctl.watch.journal import JournalThread
 from mastctl.watch.metrics import Metrics
-from mastctl.watch.reference import SENTINEL_FOLDER
 from mastctl.watch.residuals import CalibrationHealth, mast_verdict
-from mastctl.watch.sentinel import SentinelFindings
+from mastctl.watch.sentinel import SENTINEL_FOLDER, SentinelFindings
 
 log = logging.getLogger(__name__)
 

@@ -29,8 +29,7 @@ from mastctl.setup.machine import (
     examine_kept,
     examine_port,
 )
-from mastctl.watch.reference import SENTINEL_FOLDER
-from mastctl.watch.sentinel import read_folder, standing
+from mastctl.watch.sentinel import SENTINEL_FOLDER, read_folder, standing
 
 
 def examine(

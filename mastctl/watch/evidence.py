@@ -8,24 +8,103 @@ while the mast file holds, and is a martingale as pointings come in: the chance 
 most 1/k (Ville's inequality; Ramdas et al., "Game-theoretic statistics and safe anytime-valid inference",
 2023). So it may be looked at after each pointing, and the false alarms do not add up.
 
-The pointings enter by sums only (`Sums`), which add up over time.
+The pointings enter by sums only (`Sums`), which add up over time. What is judged of one is not the whole
+residual but what is left of it beside the joints: where the picture shows the target, less where position,
+mast file and *measured* joint angles put it. A servo that stops a count short is a matter of the servo, not
+of the calibration.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from pydantic import ConfigDict, TypeAdapter, with_config
 
 from calib.errors import CalibError
+from calib.files.mast_file import StoredRig
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.covariance import JOINT_NAMES, click_rates, pixel_rates
 from calib.geometry.parameters import parameter_names, parameter_part
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, ReadOnlyArrays, tangents
-from mastctl.watch.pointings import Measured
+from drivers.interfaces import COARSE_COUNT_RAD
+from mastctl.answers import MeasuredPointing
+from mastctl.control.records import Operation
+from mastctl.watch.journal import Journal
+
+DISAGREE = "eyes_disagree"
+
+
+@with_config(ConfigDict(extra="forbid", allow_inf_nan=False))
+class Measured(MeasuredPointing):
+    """A pointing of which a new picture was taken, as the journal has it."""
+
+
+_MEASURED = TypeAdapter(Measured)
+
+
+def measured_of(record: Any) -> Measured:
+    """Return the pointing of a line of the journal. Raises ValueError for anything else."""
+    return _MEASURED.validate_python(record)
+
+
+def measured_by(operation: Operation, mast: StoredRig, time_s: float) -> Measured | None:
+    """Return what a pointing that has ended measured; None if it was none, or measured nothing.
+
+    One that failed because another camera did not confirm the measurement counts too: a bumped camera does
+    that. Of two pointings at one target the first counts; the second starts from the first one's result.
+    """
+    pixel = operation.request.get("pixel")
+    confirmed = operation.state == "done"
+    if not isinstance(pixel, Mapping) or not (confirmed or (operation.error or {}).get("code") == DISAGREE):
+        return None
+    source, rig = str(pixel.get("camera")), mast.rig
+    partners = [a if source == b else b for a, b in rig.stereo.values() if source in (a, b)]
+    steps = {step.name: step.detail for step in reversed(operation.steps)}  # the first of each name
+    try:
+        rest, seen, settled, found = (steps[name] for name in ("rest", "triangulate", "settle", "measure"))
+        found = steps.get("repeat", found)
+        to_rad = [settled["true_pan_rad"], settled["true_tilt_rad"]]
+        view = rig.camera_in_rover(found["camera"], *to_rad)
+        predicted = view.project(seen["position_m"])[0].tolist()
+        counts = settled.get("count_rad", {})
+        return measured_of(
+            {
+                "time_s": time_s,
+                "operation": operation.id,
+                "confirmed": confirmed,
+                "mast_digest": mast.digest,
+                "source": source,
+                "partner": partners[0],
+                "camera": found["camera"],
+                "from_rad": [rest["true_pan_rad"], rest["true_tilt_rad"]],
+                "to_rad": to_rad,
+                "position_m": seen["position_m"],
+                "range_m": math.dist(seen["position_m"], view.C.tolist()),
+                "residual_px": found["residual_px"],
+                "off_px": [a - b for a, b in zip(found["pixel_px"], predicted, strict=True)],
+                "match_sigma_px": found["sigma_px"],
+                "count_rad": [counts.get(axis, COARSE_COUNT_RAD) for axis in ("pan", "tilt")],
+            }
+        )
+    except (LookupError, TypeError, ValueError):  # it did not come so far, or could not measure a number
+        return None
+
+
+FILE = "pointings.jsonl"
+MOST_BYTES = 4 << 20
+"""At which the file is written anew with what still counts; some 6000 pointings."""
+
+
+def pointing_journal(folder: Path) -> Journal[Measured]:
+    """Return the journal of pointings in a state folder."""
+    return Journal(folder / FILE, "pointings", dict, measured_of, most_bytes=MOST_BYTES)
+
 
 TURN_RAD = 2e-3
 """Usual size of a bump, about each axis."""
@@ -37,34 +116,20 @@ FAR = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Sums:
-    """What some pointings say together: n, HᵀR⁻¹H, HᵀR⁻¹r, rᵀR⁻¹r, with H the rates, then the turns.
+    """What some pointings say together.
 
-    ``first_s``: when the first of them was.
+    ``gram`` is the sum of [H r]ᵀ R⁻¹ [H r], with H the rates, then the turns; ``first_s``: when the first was.
     """
 
     count: int
-    normal: FloatArray
-    right: FloatArray
-    square: float
+    gram: FloatArray
     first_s: float
 
     def __add__(self, other: Sums) -> Sums:
-        return Sums(
-            self.count + other.count,
-            self.normal + other.normal,
-            self.right + other.right,
-            self.square + other.square,
-            min(self.first_s, other.first_s),
-        )
+        return Sums(self.count + other.count, self.gram + other.gram, min(self.first_s, other.first_s))
 
     def __sub__(self, other: Sums) -> Sums:
-        return Sums(
-            self.count - other.count,
-            self.normal - other.normal,
-            self.right - other.right,
-            self.square - other.square,
-            self.first_s,
-        )
+        return Sums(self.count - other.count, self.gram - other.gram, self.first_s)
 
 
 @dataclass(frozen=True)
@@ -96,10 +161,8 @@ class Evidence:
 
 def sums_of(one: Expected, off_px: Sequence[float], time_s: float) -> Sums:
     """Return what a single pointing says."""
-    whole = np.concatenate([one.rates, one.turned], axis=1)
-    weight = np.linalg.inv(one.noise_px2)
-    off = np.array(off_px)
-    return Sums(1, whole.T @ weight @ whole, whole.T @ weight @ off, float(off @ weight @ off), time_s)
+    whole = np.column_stack([one.rates, one.turned, np.array(off_px)])
+    return Sums(1, whole.T @ np.linalg.inv(one.noise_px2) @ whole, time_s)
 
 
 class Judge:
@@ -112,17 +175,14 @@ class Judge:
         self._root = vectors[:, kept] * np.sqrt(values[kept])  # covariance = root rootᵀ
         self._size = len(covariance)
 
-    def square(self, sums: Sums) -> float:
-        """Return the residuals' square over their covariance."""
-        return self._reduced(sums)[1]
-
     def weigh(self, sums: Sums, confirmed: Sums | None = None) -> Evidence:
         """Return what pointings say.
 
         ``confirmed``: those of them that are no false matches for sure, all by default: only they can say
         that everything is wider. A turn has to account for all.
         """
-        normal, square, right = self._reduced(sums)
+        reduced = self._reduced(sums)
+        normal, right, square = reduced[:-1, :-1], reduced[:-1, -1], float(reduced[-1, -1])
         count, first_s, turned = sums.count, sums.first_s, {}
         for number, camera in enumerate(self._cameras):
             part = slice(3 * number, 3 * number + 3)
@@ -131,23 +191,19 @@ class Judge:
             accounts = left <= FAR**2 * 2 * sums.count
             turned[camera] = one if accounts else replace(one, log_evidence=min(0.0, one.log_evidence))
         if confirmed is not None:
-            sums, square = confirmed, self.square(confirmed)
+            sums, square = confirmed, float(self._reduced(confirmed)[-1, -1])
         wider = [-2 * sums.count * math.log(times) + 0.5 * square * (1.0 - times**-2) for times in TIMES]
         log_wider = _log_mean(wider)
         log_evidence = _log_mean([log_wider, *(one.log_evidence for one in turned.values())])
         times = math.sqrt(max(square, 0.0) / max(2 * sums.count, 1))
         return Evidence(count, first_s, times, log_evidence, log_wider, turned)
 
-    def _reduced(self, sums: Sums) -> tuple[FloatArray, float, FloatArray]:
-        """Take out what the mast file's own covariance explains: turns' normal matrix, square, right side."""
-        p, root = self._size, self._root
-        inner = np.eye(root.shape[1]) + root.T @ sums.normal[:p, :p] @ root
-        across = root.T @ np.concatenate([sums.right[:p, None], sums.normal[:p, p:]], axis=1)
-        solved = np.linalg.solve(inner, across)
-        square = sums.square - float(across[:, 0] @ solved[:, 0])
-        right = sums.right[p:] - across[:, 1:].T @ solved[:, 0]
-        normal = sums.normal[p:, p:] - across[:, 1:].T @ solved[:, 1:]
-        return normal, square, right
+    def _reduced(self, sums: Sums) -> FloatArray:
+        """The sums of turns and residuals, without what the mast file's own covariance explains."""
+        p, root, gram = self._size, self._root, sums.gram
+        inner = np.eye(root.shape[1]) + root.T @ gram[:p, :p] @ root
+        across = root.T @ gram[:p, p:]
+        return np.asarray(gram[p:, p:] - across.T @ np.linalg.solve(inner, across))
 
 
 def _turned(normal: FloatArray, right: FloatArray) -> Turned:

@@ -20,7 +20,7 @@ from calib.geometry.rig import Rig
 from calib.matching.warp import grey
 from mastctl.client import Client, ClientError
 from mastctl.errors import MastctlError
-from mastctl.watch.reference import Reference, ReferencePicture, add_look, read_looks, read_reference
+from mastctl.watch.sentinel import Reference, ReferencePicture, add_look, read_looks, read_reference
 
 TURN_TIMEOUT_S = 90.0
 EDGE_RAD = 0.05
@@ -182,12 +182,12 @@ def view_shifts(rig: Rig, reference: Reference, pictures: Sequence[ReferencePict
         pixels, moved, sigma = seen_again(model, then.image, now.image)
         if len(pixels):
             # a pose that the head itself reports as another is no drift
-            moved = moved - _told_px(rig, then, now, pixels)
+            moved = moved - _reported_px(rig, then, now, pixels)
         shifts.append(ViewShift(now.camera, now.pose, then.pan_rad, then.tilt_rad, pixels, moved, sigma))
     return shifts
 
 
-def _told_px(rig: Rig, then: ReferencePicture, now: ReferencePicture, pixels: np.ndarray) -> np.ndarray:
+def _reported_px(rig: Rig, then: ReferencePicture, now: ReferencePicture, pixels: np.ndarray) -> np.ndarray:
     """How far pixels (n, 2) move by what the joints read now and read then."""
     before = rig.camera_in_rover(then.camera, then.pan_rad, then.tilt_rad)
     after = rig.camera_in_rover(then.camera, now.pan_rad, now.tilt_rad)

@@ -29,9 +29,18 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from mastctl.answers import CalibrationTold, CountedPointing, ResidualVerdict, SelfCheck, SentinelTold
 from mastctl.control.records import Operation
-from mastctl.watch.evidence import Evidence, Expected, Judge, Sums, expected, sums_of
+from mastctl.watch.evidence import (
+    Evidence,
+    Expected,
+    Judge,
+    Measured,
+    Sums,
+    expected,
+    measured_by,
+    pointing_journal,
+    sums_of,
+)
 from mastctl.watch.journal import JournalThread
-from mastctl.watch.pointings import Measured, measured_by, pointing_journal
 
 log = logging.getLogger(__name__)
 

@@ -10,8 +10,7 @@ from mastctl.errors import Unable
 from mastctl.http import PREFIX
 from mastctl.http.entrance import from_this_machine
 from mastctl.watch.metrics import CONTENT_TYPE
-from mastctl.watch.reference import SENTINEL_FOLDER
-from mastctl.watch.sentinel import findings
+from mastctl.watch.sentinel import SENTINEL_FOLDER, findings
 from mastctl.web.commands import caller_of
 from mastctl.web.described import file_of
 from mastctl.web.parts import Here

@@ -16,7 +16,7 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid
 from calib.geometry.stereo import triangulate
 from mastctl.packaged import default_config
-from mastctl.watch.pointings import Measured
+from mastctl.watch.evidence import Measured
 
 DAY_S = 86400.0
 NOON_S = 20_000 * DAY_S + DAY_S / 2

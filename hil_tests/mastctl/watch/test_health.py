@@ -16,9 +16,9 @@ from hil_tests.mastctl.watch.histories import NOON_S, bumped, pointing, stored_r
 from hil_tests.waiting import until
 from mastctl.control.records import Operation
 from mastctl.motion.results import Step
-from mastctl.watch import pointings
+from mastctl.watch import evidence
+from mastctl.watch.evidence import FILE, Measured, measured_by, measured_of, pointing_journal
 from mastctl.watch.journal import JournalThread
-from mastctl.watch.pointings import FILE, Measured, measured_by, measured_of, pointing_journal
 from mastctl.watch.residuals import CalibrationHealth
 
 STORED = stored_rig()
@@ -89,7 +89,7 @@ def test_pointings_outlive_a_restart_and_a_torn_line_costs_one(tmp_path: Path) -
 def test_a_file_that_is_full_is_written_anew_with_what_counts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pointings, "MOST_BYTES", 3000)
+    monkeypatch.setattr(evidence, "MOST_BYTES", 3000)
     journal, known = pointing_journal(tmp_path), history(30)
     for number, one in enumerate(known):
         journal.append(one, known[max(0, number - 1) : number + 1])

@@ -18,7 +18,7 @@ from mastctl.cli.main import main
 from mastctl.client import Client
 from mastctl.daemon import RunningDaemon
 from mastctl.watch.looks import watch
-from mastctl.watch.reference import LOOKS, read_looks, read_reference
+from mastctl.watch.sentinel import LOOKS, read_looks, read_reference
 
 Run = Callable[..., tuple[int, str, str]]
 

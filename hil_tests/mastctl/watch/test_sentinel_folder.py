@@ -13,9 +13,9 @@ import pytest
 
 from calib.calibrate.drift import SceneDrift
 from calib.errors import BadFile
-from mastctl.watch import reference as folder_module
+from mastctl.watch import sentinel as folder_module
 from mastctl.watch.looks import is_due
-from mastctl.watch.reference import (
+from mastctl.watch.sentinel import (
     LOOKS,
     REFERENCE,
     Reference,
@@ -24,8 +24,8 @@ from mastctl.watch.reference import (
     read_looks,
     read_reference,
     save_reference,
+    standing,
 )
-from mastctl.watch.sentinel import standing
 
 NOW = datetime(2026, 5, 4, 12, 0, tzinfo=UTC)
 MOVED = "the images moved by up to 1.80 px, 9 sigma"
