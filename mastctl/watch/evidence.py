@@ -118,7 +118,7 @@ FAR = 3.0
 class Sums:
     """What some pointings say together.
 
-    ``gram`` is the sum of [H r]ᵀ R⁻¹ [H r], with H the rates, then the turns; ``first_s``: when the first was.
+    ``gram``: the sum of [H r]ᵀ R⁻¹ [H r], with H the rates, then the turns; ``first_s``: when the first was.
     """
 
     count: int
