@@ -76,26 +76,11 @@ def run(
 ) -> None:
     """Run a daemon in the main thread until a signal ends it; returns after the mast was stopped.
 
-    The signals are those of `mastctl.signals.wanted`. A second one has nobody waited for; SIGTSTP (Ctrl-Z)
-    stops the mast and then suspends the process.
+    The signals are those of `mastctl.signals.wanted`. After a second one no client is waited for; SIGTSTP
+    (Ctrl-Z) stops the mast and then suspends the process. ``on_ready`` gets the address when requests are
+    answered; a simulated rover that ``draws_ahead`` then draws its cameras' first pictures.
 
-    Parameters
-    ----------
-    config
-        Its configuration.
-    on_ready
-        Called once with the address when requests are answered.
-    clock
-        The service's clock; CLOCK_MONOTONIC by default.
-    draws_ahead
-        Whether a simulated rover draws its cameras' first pictures as soon as requests are answered.
-
-    Raises
-    ------
-    AddressInUse, StateInUse
-        If the address is taken, or the state folder; the hardware was not touched.
-    BadFile, DriverError
-        From opening the service.
+    Raises AddressInUse, StateInUse before the hardware is touched; BadFile, DriverError.
     """
     sys.setswitchinterval(SWITCH_S)
     with _listening(config.listen) as (listener, url):
@@ -116,20 +101,7 @@ def run(
 
 
 class RunningDaemon:
-    """A daemon in a thread of this process, for the demo and for tests. A context manager.
-
-    Parameters
-    ----------
-    config, clock
-        As for `run`.
-
-    Attributes
-    ----------
-    url
-        Its address.
-    service
-        What it holds.
-    """
+    """A daemon in a thread of this process, for the demo and for tests. A context manager."""
 
     def __init__(self, config: Config, clock: Clock | None = None) -> None:
         self._exit = contextlib.ExitStack()

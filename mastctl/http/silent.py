@@ -1,8 +1,8 @@
-"""TCP connections without a request: each is closed after a while, the oldest when there are too many.
+"""TCP connections that wait for their client's request: closed after a while, the oldest when they are many.
 
-The web server bounds neither how long a client takes to send a request's headers nor how many connections it
-opens. A hundred clients that send nothing could use up the descriptors of the process, and then a stop over
-HTTP would not arrive.
+The web server bounds neither how long a client takes to send a request nor how many connections it opens. A
+hundred clients that send nothing, or headers without their body, could use up the descriptors of the process,
+and then a stop over HTTP would not arrive.
 """
 
 from __future__ import annotations
@@ -15,21 +15,17 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 SILENT_S = 20.0  # twice as long as the server keeps a connection for its next request
 SWEEP_S = 1.0
 
 
 class SilentConnections:
-    """The connections that have no request at present.
+    """The connections whose client has to send: no request has come, or no whole one.
 
-    Parameters
-    ----------
-    most
-        How many there may be; a quarter of the process' descriptors by default.
-    now_s
-        A monotonic clock, real time by default: clients do not live in simulated time.
+    There may be ``most``, by default a quarter of the process' descriptors. ``now_s`` is real time, since
+    clients do not live in simulated time.
     """
 
     def __init__(self, most: int | None = None, now_s: Callable[[], float] = time.monotonic) -> None:
@@ -38,7 +34,7 @@ class SilentConnections:
         self._since: dict[tuple[Any, ...], tuple[socket.socket, float]] = {}  # by client, the oldest first
 
     def add(self, connection: socket.socket, client: tuple[Any, ...]) -> None:
-        """Note a connection without a request; the oldest is closed if these are too many.
+        """Note a connection that waits for its client; the oldest is closed if these are too many.
 
         ``client`` is the host and port of the client, as ASGI states them.
         """
@@ -50,7 +46,7 @@ class SilentConnections:
             self._close(next(iter(self._since)))
 
     def close_old(self) -> None:
-        """Close connections that have had no request for ``SILENT_S``; forget those that have ended."""
+        """Close connections on which nothing came for ``SILENT_S``; forget those that have ended."""
         latest_s = self._now_s() - SILENT_S
         for client, (connection, since_s) in list(self._since.items()):
             if since_s <= latest_s or connection.fileno() < 0:
@@ -63,13 +59,27 @@ class SilentConnections:
             self.close_old()
 
     def around(self, app: ASGIApp) -> ASGIApp:
-        """Return an application that notes which connections have a request."""
+        """Return an application that notes which connections have a whole request."""
 
         async def noted(scope: Scope, receive: Receive, send: Send) -> None:
             client = tuple(scope.get("client") or ())
             connection, _ = self._since.pop(client, (None, 0.0))
+            whole = connection is None or scope["type"] != "http"
+
+            async def part() -> Message:
+                nonlocal whole
+                if whole or connection is None:
+                    return await receive()
+                self.add(connection, client)
+                try:
+                    message = await receive()
+                finally:
+                    self._since.pop(client, None)
+                whole = not message.get("more_body", False)
+                return message
+
             try:
-                await app(scope, receive, send)
+                await app(scope, part, send)
             finally:
                 if connection is not None and connection.fileno() >= 0:
                     self.add(connection, client)
