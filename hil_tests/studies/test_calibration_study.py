@@ -6,7 +6,6 @@ import os
 import sys
 from collections.abc import Iterator
 from concurrent.futures import Executor, ThreadPoolExecutor
-from contextlib import nullcontext
 from types import ModuleType
 
 import numpy as np
@@ -16,7 +15,7 @@ from calib.files.mast_file import load_rig
 from calib.survey.records import Sigma
 from hil_tests.mastctl.calibration.survey_world import RIG_FILE
 from hil_tests.support.sim_survey.plan import SurveyPlan
-from mastctl.experiment.tasks import NoExecutor, Work, open_executor
+from mastctl.experiment.tasks import NoExecutor, open_executor, run_tasks
 from tools.studies.calibration import main, table_iv_rows, variant_rows
 from tools.studies.calibration_survey import (
     SurveyOutcome,
@@ -37,8 +36,7 @@ RIG = load_rig(RIG_FILE).rig
 
 def run(executor: Executor, seed: int = 3, chosen: tuple[Variant, ...] = CHOSEN) -> tuple[SurveyOutcome, ...]:
     tasks = survey_tasks(RIG, surveys=1, targets=3, seed=seed, chosen=chosen)
-    work = Work(one_survey, tasks, lambda task: task.variant.label)
-    return tuple(work.run(lambda: nullcontext(executor)))
+    return tuple(run_tasks(executor, one_survey, tasks))
 
 
 @pytest.fixture(scope="module")

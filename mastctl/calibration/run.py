@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,6 +14,7 @@ from calib.calibrate.survey import fit_joint
 from calib.errors import CalibError
 from calib.files.mast_file import StoredRig
 from calib.survey.check import check_survey
+from calib.survey.find_dots import Progress, detect_survey
 from calib.survey.records import Survey, SurveyFinding
 from mastctl.calibration.mast_file import save_new, with_fit
 from mastctl.calibration.reasons import CalibrationVerdict
@@ -49,6 +51,24 @@ class Calibrated:
     undetected: tuple[tuple[str, str], ...]
     saved: StoredRig
     previous: Path | None
+
+
+def without_dots(survey: Survey) -> tuple[str, ...]:
+    """Return the names of images with a file whose dots are not known."""
+    return tuple(i.name for i in survey.images if i.name not in survey.dots and i.file != Path())
+
+
+def with_dots(
+    survey: Survey, executor: Executor, progress: Progress | None = None
+) -> tuple[Survey, tuple[tuple[str, str], ...]]:
+    """Return the survey with the dots of every image that shows them, and (image, reason) of the others.
+
+    ``progress`` is called after each image: how many are done, of how many, and its name.
+    """
+    clicked = {click.image for click in survey.clicks}  # a picture of a check point need not show a board
+    found = detect_survey(survey, executor, progress)
+    failures = [(name, reason) for name, reason in found.failures.items() if name not in clicked]
+    return replace(survey, dots=found.dots), tuple(failures)
 
 
 def checked_survey(survey: Survey, method: Method = "joint") -> tuple[SurveyFinding, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
@@ -159,14 +160,18 @@ def _in_use(args: argparse.Namespace) -> StoredRig | None:
 def _with_dots(args: argparse.Namespace, survey: Survey) -> tuple[Survey, tuple[tuple[str, str], ...]]:
     """Find dots in the images that dots.csv does not name, with a progress bar on stderr."""
 
-    from mastctl.calibration.detection import missing, with_dots
+    from mastctl.calibration.run import with_dots, without_dots
+    from mastctl.experiment.tasks import open_executor
 
-    count = len(missing(survey))
+    count = len(without_dots(survey))
     if not count:
         return survey, ()
-    with output.progress_bar(args.json) as progress:
+    workers = min(count, os.cpu_count() or 1)
+    with output.progress_bar(args.json) as progress, open_executor("local", workers) as executor:
         task = progress.add_task("finding dots", total=count)
-        survey, undetected = with_dots(survey, lambda done, _, name: progress.update(task, completed=done))
+        survey, undetected = with_dots(
+            survey, executor, lambda done, _, name: progress.update(task, completed=done)
+        )
     for name, reason in undetected:
         output.tell(f"warning: no dots in image {name}: {reason}")
     return survey, undetected

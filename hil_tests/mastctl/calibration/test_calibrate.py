@@ -17,7 +17,7 @@ from calib.files.mast_file import load_rig, save_rig
 from calib.survey.reader import read_survey
 from hil_tests.mastctl.calibration.survey_world import edit_yaml, navcam_rig, navcam_survey, write_folder
 from hil_tests.support.sim_survey.board import draw_board, photograph
-from mastctl.calibration.detection import missing, with_dots
+from mastctl.calibration.run import with_dots, without_dots
 from mastctl.cli.main import main
 
 SIGMAS = 4.5
@@ -166,10 +166,10 @@ def test_dots_are_found_where_dots_csv_has_none(tmp_path: Path) -> None:
     known = {name: dots for name, dots in survey.dots.items() if name not in names}
     folder = write_folder(replace(survey, dots=known), tmp_path / "s", pictures)
     read = read_survey(folder)
-    assert missing(read) == tuple(names)
+    assert without_dots(read) == tuple(names)
     steps: list[int] = []
     with ThreadPoolExecutor(1) as executor:
-        found, undetected = with_dots(read, lambda done, of, name: steps.append(of - done), executor)
+        found, undetected = with_dots(read, executor, lambda done, of, name: steps.append(of - done))
     assert steps == [3, 2, 1, 0]
     assert [name for name, _ in undetected] == [names[3]]
     for image in survey.images[:3]:

@@ -21,8 +21,7 @@ from hil_tests.support.sim_survey.blunders import (
     with_swapped_boards,
     with_wrong_prism,
 )
-from mastctl.calibration.detection import with_dots
-from mastctl.calibration.run import FITS, checked_survey
+from mastctl.calibration.run import FITS, checked_survey, with_dots
 from mastctl.calibration.verdict import judge
 from mastctl.cli.main import main
 
@@ -225,7 +224,7 @@ def test_a_picture_that_cannot_be_read_is_named_with_the_reason(
     with_picture(data)(folder)
     survey = read_survey(folder)
     with ThreadPoolExecutor(1) as executor:
-        found, undetected = with_dots(survey, None, executor)
+        found, undetected = with_dots(survey, executor)
     assert capfd.readouterr().err == "", "nothing but the reason is told"
     assert undetected == (("navcam_left-001", f"one.png is not a picture that can be read{why}"),)
     assert len(found.dots) == len(survey.images) - 1

@@ -6,8 +6,6 @@ import json
 import os
 import pickle
 import resource
-import select
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -111,34 +109,3 @@ def test_a_report_that_cannot_be_written_does_not_hide_the_mast_file(
     assert error["code"] == "report_not_written"
     assert f"the mast file {out} is saved" in error["message"]
     load_rig(out)
-
-
-WORKERS = """
-import os, sys, time
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
-from mastctl.calibration.detection import _worker
-if __name__ == "__main__":
-    with ProcessPoolExecutor(1, get_context("spawn"), _worker) as pool:
-        print(pool.submit(os.getpid).result(), flush=True)
-        pool.submit(time.sleep, 3600.0)
-        time.sleep(3600.0)
-"""
-
-
-def test_no_searching_process_outlives_the_command(tmp_path: Path) -> None:
-    script = tmp_path / "workers.py"
-    script.write_text(WORKERS)
-    with subprocess.Popen(
-        [sys.executable, str(script)], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-    ) as it:
-        assert it.stdout is not None
-        worker = int(it.stdout.readline())
-        assert Path(f"/proc/{worker}").exists()
-        it.kill()
-        # Its end comes when the last process that holds it has gone; the worker alone would sleep an hour.
-        gone = select.select([it.stdout], [], [], 60.0)[0]
-        if not gone:
-            os.kill(worker, signal.SIGKILL)
-        assert gone, "the worker outlived the command"
-    assert it.returncode == -signal.SIGKILL

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
-from contextlib import nullcontext
-from functools import partial
 
 import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig
 from hil_tests.mastctl.calibration.survey_world import RIG_FILE
-from mastctl.experiment.tasks import Work, open_executor
+from mastctl.experiment.tasks import open_executor, run_tasks
 from tools.campaigns import refine
 
 
@@ -37,10 +35,9 @@ def address() -> Iterator[str]:
 def test_a_campaign_on_a_cluster_comes_to_the_same_bits(address: str) -> None:
     rig = load_rig(RIG_FILE).rig
     blocks = [refine.RefineBlock(rig, (2.0, 2.0), 1.0, n, 1, 9, 0.2, 0.4, 1) for n in (0, 10)]
-    work = Work(refine.run_block, blocks, lambda _: "small")
     with open_executor("local", 2) as local, open_executor(f"dask:{address}") as cluster:
         ours, theirs = (
-            [[vars(case) for case in block] for block in work.run(partial(nullcontext, place))]
+            [[vars(case) for case in block] for block in run_tasks(place, refine.run_block, blocks)]
             for place in (local, cluster)
         )
     np.testing.assert_equal(theirs, ours)

@@ -19,12 +19,8 @@ class Draw:
     scale: Any = 1.0
 
 
-calls: list[int] = []
-
-
 def drawn(task: Draw) -> np.ndarray:
     """Numbers, after a while that is another each time."""
-    calls.append(task.seed)
     time.sleep(random.random() * 0.02)
     return np.random.default_rng(task.seed).standard_normal(task.count) * task.scale
 
