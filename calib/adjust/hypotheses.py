@@ -53,6 +53,9 @@ boards to the rover: tapes show a slip that sharp images alone leave to their bo
 LARGEST = 0.5
 """Radians, or part of the focal length: what is larger is no slip, knock or other focus."""
 
+SURE, LITTLE_FOCAL = 3.0, 0.05
+"""A camera turned alone if its focal length changed by fewer sigmas, or by less of this part of the turn."""
+
 Course = Literal["always", "once", "each", "from"]
 Rates = Callable[[ImageTerm, Motions], FloatArray]
 
@@ -417,10 +420,8 @@ def _changes(fit: ScoredFit) -> Iterator[Hypothesis]:
 
     def sentence(found: Finding) -> str:
         _, board, placement = found.subject
-        return (
-            f"board {board} moved during placement {placement}, between pictures {found.before} and "
-            f"{found.after}, by about {_milli(found.values[3:])} mm and {_milli(found.values[:3])} mrad"
-        )
+        by = f", by about {_milli(found.values[3:])} mm and {_milli(found.values[:3])} mrad"
+        return board_moved(board, placement, found.before, found.after, by)
 
     for board in dict.fromkeys(image.board for image in fit.images):
         if board not in fit.problem.fixed:
@@ -603,10 +604,25 @@ def _drawing(fit: ScoredFit) -> Iterator[Hypothesis]:
     yield Hypothesis(DRAWING, (), rows, sentence)
 
 
+def board_moved(board: str, placement: str, before: str, after: str, by: str = "") -> str:
+    """Return the sentence on a board that moved during a placement, and what to do."""
+    return (
+        f"board {board} moved during placement {placement}, between pictures {before} and {after}{by}, or "
+        f"pan slipped: give the pictures from {after} on a placement of their own in images.csv, or take "
+        "them again"
+    )
+
+
 def _milli(size: FloatArray) -> str:
     """The length of something in thousandths, with two digits at least."""
     length = 1e3 * float(np.linalg.norm(size))
     return f"{length:.1f}" if length >= 1.0 else f"{length:.2g}"
+
+
+def _only_turned(change: Finding) -> bool:
+    """Whether a camera that changed has the focal length that it had, as far as pictures show it."""
+    focal, turn = abs(float(change.values[0])), float(np.linalg.norm(change.values[1:]))
+    return focal < max(SURE * float(change.sigma[0]), LITTLE_FOCAL * turn)
 
 
 SENTENCES: Mapping[tuple[str, str], Callable[[Finding], str]] = {
@@ -620,7 +636,10 @@ SENTENCES: Mapping[tuple[str, str], Callable[[Finding], str]] = {
         "picture to the last: a mount or an encoder creeps; fasten it and take the pictures again"
     ),
     ("camera", "change"): lambda found: (
-        f"from picture {found.after} on {found.subject[1]} is another camera (focal length "
+        f"{found.subject[1]} was knocked between pictures {found.before} and {found.after}, and turned by "
+        f"about {_milli(found.values[1:])} mrad: fasten it and take the pictures again"
+        if _only_turned(found)
+        else f"from picture {found.after} on {found.subject[1]} is another camera (focal length "
         f"{100 * found.values[0]:+.2f} %, turned by {_milli(found.values[1:])} mrad): it was refocused or "
         "knocked there; fasten it and take the pictures again"
     ),

@@ -49,11 +49,21 @@ SIGMA_COLUMN = "sigma_px"
 FURTHEST_M, LARGEST_ANGLE_RAD, WORST_SIGMA_PX = 1e5, 1e4, 100.0
 """Beyond these a number is not a measurement; the check of the survey judges unlikely ones."""
 
+SMALLEST_SIGMA = 1e-9
+"""What is stated as exacter, and not as exact, leaves nothing of a float where sigmas are squared."""
+
+
+def _exact_or_sigma(value: float) -> float:
+    if 0.0 < value < SMALLEST_SIGMA:
+        raise problem("", f"is {value:g} where 0 or at least {SMALLEST_SIGMA:g} is expected")
+    return value
+
 
 _Metres = Annotated[float, Field(ge=-FURTHEST_M, le=FURTHEST_M)]
 _Place = Annotated[list[_Metres], Field(min_length=3, max_length=3)]
 _Length = Annotated[float, Field(gt=0.0, le=FURTHEST_M)]
-_Uncertainty = Annotated[float, Field(ge=0.0, le=10.0)]
+_Sigma = Annotated[float, Field(ge=SMALLEST_SIGMA, le=FURTHEST_M)]
+_Uncertainty = Annotated[float, Field(ge=0.0, le=10.0), AfterValidator(_exact_or_sigma)]
 _Dots = Annotated[int, Field(ge=2, le=200)]
 _Three = Field(json_schema_extra={"minProperties": 3})
 
@@ -95,8 +105,8 @@ class DotGridRecord(Record):
 class StationSigmaRecord(Record):
     """Standard deviations, one axis each, of a survey with a station."""
 
-    station_m: _Length
-    dot_px: _Length
+    station_m: _Sigma
+    dot_px: _Sigma
     joint_rad: _Uncertainty = 0.0
     prism_cad_m: _Uncertainty = 0.0
 
@@ -104,7 +114,7 @@ class StationSigmaRecord(Record):
 class BenchSigmaRecord(Record):
     """Standard deviations, one axis each, of a bench."""
 
-    corner_px: _Length
+    corner_px: _Sigma
     joint_rad: _Uncertainty = 0.0
 
 

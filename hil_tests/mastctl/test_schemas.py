@@ -64,6 +64,7 @@ CANNOT = {
     "survey": {
         "dots touch": "one value against another",
         "no direction": "a vector's length",
+        "no float's square": "exact, or at least so much",
         "no such pair": "a name that another file must have",
         "tapes on a line": "points against each other",
     },

@@ -11,7 +11,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from calib.calibrate.bench.problem import FEWEST_CORNERS
+from calib.calibrate.bench import FEWEST_CORNERS
 from calib.files.mast_file import parse_rig
 from calib.geometry.mode import FLIPS, SensorMode
 from calib.geometry.rig import Rig

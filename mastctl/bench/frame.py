@@ -10,8 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.adjust.result import BenchCalibration
-from calib.calibrate.bench.fit import fit_bench
-from calib.calibrate.bench.problem import BenchOptions
+from calib.calibrate.bench import fit_bench
 from calib.calibrate.starts.bench import BenchNotFitted, SomethingChanged
 from calib.geometry.rig import Mast, Rig
 from calib.geometry.rigid import Rigid
@@ -73,7 +72,6 @@ def fit_in_frame(
     survey: Survey,
     frame: RoverFrame,
     former: Rig | None,
-    options: BenchOptions | None = None,
     moved: Mapping[str, float] | None = None,
 ) -> BenchCalibration:
     """Fit a bench in the rover frame that was stated; ``former`` is the rig as it was known before.
@@ -88,9 +86,8 @@ def fit_in_frame(
     BenchNotFitted
         If the images do not determine a rig.
     """
-    options = options or BenchOptions()
     try:
-        return _fit_in_frame(survey, frame, former, options)
+        return _fit_in_frame(survey, frame, former)
     except SomethingChanged:
         raise
     except BenchNotFitted as reason:
@@ -104,34 +101,33 @@ def fit_in_frame(
         ]
         corners = {i.name: survey.corners[i.name] for i in rest if i.name in survey.corners}
         try:
-            done = _fit_in_frame(replace(survey, images=rest, corners=corners), frame, former, options)
+            done = _fit_in_frame(replace(survey, images=rest, corners=corners), frame, former)
         except BenchNotFitted:
             raise BenchNotFitted(
                 f"{'; '.join(sentences)}, and what is left is too little: {reason}"
             ) from None
-        return replace(done, notes=(*done.notes, *sentences))
+        return replace(done, notes=(*done.notes, *sentences, f"with these, {reason}"))
 
 
-def _fit_in_frame(
-    survey: Survey, frame: RoverFrame, former: Rig | None, options: BenchOptions
-) -> BenchCalibration:
+def _fit_in_frame(survey: Survey, frame: RoverFrame, former: Rig | None) -> BenchCalibration:
     """The fit of what a survey shows."""
     survey, notes = without_lonely(survey)
+    stated: dict[str, Any] = {}
     if frame.mast_at is not None:
         place = Mast(np.array(frame.mast_at[:3]), np.array(frame.mast_at[3:])).rover_from_mast
-        options = replace(options, rover_from_mast=place)
+        stated = {"rover_from_mast": place}
     elif frame.board_at is not None:
         first = next((i for i in survey.images if i.name in survey.corners), None)
         if first is None:
             raise BenchNotFitted("no picture shows a board, and the rover frame should hang on the first")
         known = (first.board, first.placement), rover_from_board(frame.board_at)
-        options = replace(options, rover_from_board=known)
+        stated = {"rover_from_board": known}
     elif former is not None:
-        options = replace(options, rover_from_mast=former.mast.rover_from_mast)
-    done = fit_bench(survey, options)
+        stated = {"rover_from_mast": former.mast.rover_from_mast}
+    done = fit_bench(survey, **stated)
     if frame.body:
         place, words = _by_body(done, former)
-        done = fit_bench(survey, replace(options, rover_from_mast=place))
+        done = fit_bench(survey, rover_from_mast=place)
         notes = (*notes, words)
     return replace(done, notes=(*done.notes, *notes))
 
@@ -206,9 +202,8 @@ LEAST_PX, LEAST_SCALE = 0.01, 0.1
 class FittedBench:
     """A survey's fit, with all that it says in ``calibration``; None of a stand-in.
 
-    ``boards``: placement to rover_from_board; of a board that moved meanwhile, where it stood last.
-    ``corner_rms_px``: of the fitted corners, per axis. ``sigma_scale``: how large residuals are against the
-    sigmas that corners came with.
+    ``boards``: placement to rover_from_board. ``corner_rms_px``: of the fitted corners, per axis.
+    ``sigma_scale``: how large residuals are against the sigmas that corners came with.
     """
 
     rig: Rig
@@ -226,8 +221,7 @@ def fit_in_rover(frame: RoverFrame, former: Rig, moved: Callable[[], Mapping[str
 
     def fit(survey: Survey) -> FittedBench:
         done = fit_in_frame(survey, frame, former, moved=moved())
-        # Of a board that moved, "p1 from IMAGE on" comes after "p1": where it stands now.
-        boards = {placement.split(" ")[0]: pose for (_, placement), pose in done.rover_from_board.items()}
+        boards = {placement: pose for (_, placement), pose in done.rover_from_board.items()}
         rms = float(np.sqrt(np.mean(np.square(list(done.rms_px.values())))))
         # Corners were fitted with what print and lens add; those that a run plans with come without it.
         fitted_px = np.median(np.concatenate([image.sigma_px for image in done.images]))

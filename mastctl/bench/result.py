@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from calib.adjust.result import BenchCalibration
-from calib.calibrate.bench.problem import BenchOptions
 from calib.errors import BadFile
 from calib.files.mast_file import StoredRig, joint_keys
 from calib.geometry.rig import Rig
@@ -160,7 +159,6 @@ def fit_again(
     survey: Survey,
     out: Path,
     report: Path | None,
-    options: BenchOptions,
     frame: RoverFrame,
     former: Rig | None,
     moved: Mapping[str, float],
@@ -175,7 +173,7 @@ def fit_again(
         If the images do not determine a rig; nothing is written.
     """
     checked_survey(survey)
-    fit = fit_in_frame(survey, frame, former, options, moved)
+    fit = fit_in_frame(survey, frame, former, moved)
     cameras = Counter(image.camera for image in fit.images if image.purpose != "check")
     expected = expected_pointing(fit)
     numbers = {

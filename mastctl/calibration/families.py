@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from calib.adjust.terms import ImageTerm, image_terms
-from calib.calibrate.bench.problem import bench_terms
+from calib.calibrate.bench import bench_terms
 from calib.calibrate.families import FOLDS, FamilyScore, compare_families, earned
 from calib.geometry.rigid import Rigid
 from calib.survey.records import Survey

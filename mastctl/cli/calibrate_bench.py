@@ -97,7 +97,6 @@ def survey_folder(out: Path) -> Path:
 
 
 def _again(args: argparse.Namespace) -> Answer:
-    from calib.calibrate.bench.problem import BenchOptions
     from calib.survey.reader import read_survey
     from mastctl.bench.folder import former_rig, moved_placements, read_notes
     from mastctl.bench.frame import frame_of
@@ -114,12 +113,11 @@ def _again(args: argparse.Namespace) -> Answer:
     frame = _frame(args)
     if not frame.stated:
         frame = frame_of(notes)
-    options = BenchOptions(kind=args.model)
+    if args.model is not None:
+        survey = survey.as_model(args.model)
     with output.waiting(args.json, f"fitting {len(survey.images)} images"):
         former, moved = former_rig(args.folder), moved_placements(notes)
-        done = fit_again(survey, args.out, args.report, options, frame, former, moved)
-    if args.compare_models and args.model is not None:
-        survey = survey.as_model(args.model)
+        done = fit_again(survey, args.out, args.report, frame, former, moved)
     models, lines = families_of(args, survey)
     return _answer(done, models, lines)
 

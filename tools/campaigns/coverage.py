@@ -35,7 +35,7 @@ from scipy.stats import chi2
 
 from calib.adjust.result import BenchCalibration, Calibration
 from calib.adjust.uncertainty import pixel_covariance
-from calib.calibrate.bench.fit import fit_bench
+from calib.calibrate.bench import fit_bench
 from calib.errors import CalibError
 from calib.files.mast_file import load_rig
 from calib.geometry.cahvor import CameraModel

@@ -37,7 +37,7 @@ Waves = Mapping[str, tuple[complex, complex]]
 JOINTS = ("pan", "tilt")
 
 SLIPPED = "{0} is [-+0-9.]+ ± .*slipped|slip of {0}|drift of {0}|{0} (drifts|slipped)"
-CHANGED = "{0} (is another camera|drifts)"
+CHANGED = "{0} (is another camera|was knocked|drifts)"
 """Sentences that name what happened to a joint, and to a camera."""
 
 

@@ -23,7 +23,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from calib.adjust.result import BenchCalibration, Calibration
-from calib.calibrate.bench.fit import fit_bench
+from calib.calibrate.bench import fit_bench
 from calib.calibrate.survey import fit_joint
 from calib.errors import CalibError
 from calib.geometry.rig import Rig

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.adjust.gross import bounded, gross_limit
+from calib.adjust.hypotheses import board_moved
 from calib.adjust.terms import ImageTerm
 from calib.adjust.uncertainty import SEEN_RAD
 from calib.adjust.unknowns import Estimate
@@ -40,6 +41,9 @@ NEAR_RAD, NEAR_M = 0.1, 0.05
 FEWEST_ELSEWHERE = 3
 """As many images that have a board at one other place are no blunders."""
 
+TURNABOUTS = 0.34
+"""A board stood at two places in turn if no cut divides its pictures but for this part of the fewer ones."""
+
 FEWEST_ATTITUDES = 4
 """Standstills of the head with which a start is tried."""
 
@@ -55,13 +59,11 @@ class SomethingChanged(BenchNotFitted):
 
 @dataclass(frozen=True, eq=False)
 class BenchStart:
-    """The state to begin with, images that do not agree with it, sentences for a person, and by board and
-    placement the images that agree with each other that it stood somewhere else (only such as do)."""
+    """The state to begin with, images that do not agree with it, and sentences for a person."""
 
     estimate: Estimate
     doubtful: frozenset[str]
     notes: tuple[str, ...]
-    elsewhere: Mapping[tuple[str, str], frozenset[str]]
 
 
 class _Tied(NamedTuple):
@@ -82,11 +84,11 @@ def bench_start(images: Sequence[ImageTerm], views: Mapping[str, ViewPoses], att
     Raises
     ------
     BenchNotFitted
-        If the head moved too little, or a body camera sees no board that a head camera sees.
+        If the head moved too little, a board stood at two places, or a body camera sees no board that a head
+        camera sees.
     """
     on_head = {t.camera for t in images if t.attitude is not None}
-    notes: list[str] = []
-    elsewhere: dict[tuple[str, str], set[str]] = {}
+    elsewhere = {t.board: set[str]() for t in images}
     doubtful = {name for view in views.values() for name in view.doubtful}
     cameras, boards, weight = {}, {}, dict[tuple[str, str], int]()
     for name in sorted(on_head, key=lambda n: -len(views[n].poses)):
@@ -101,9 +103,10 @@ def bench_start(images: Sequence[ImageTerm], views: Mapping[str, ViewPoses], att
         off = _far_off(tied)
         doubtful |= off
         for board in tied.mast_from_board:
-            elsewhere.setdefault(board, set()).update(
-                _agreeing([t for t in mine if t.name in off and t.board == board], tied)
-            )
+            elsewhere[board] |= _agreeing([t for t in mine if t.name in off and t.board == board], tied)
+    for board, names in elsewhere.items():
+        if len(names) >= FEWEST_ELSEWHERE:
+            _refuse_two_places([t for t in images if t.board == board], names)
     for name in views:
         if name not in on_head:
             mine = [
@@ -115,18 +118,37 @@ def bench_start(images: Sequence[ImageTerm], views: Mapping[str, ViewPoses], att
                     "put a board where both see it, or leave the camera out"
                 )
             cameras[name] = views[name].model.moved(_body(mine, views[name], boards))
-    lonely = {t.board for t in images} - set(boards)
-    for board in sorted(lonely):
-        notes.append(f"placement {board[1]} of board {board[0]} is not used: no head camera shows it well")
+    notes = [
+        f"placement {placement} of board {board} is not used: no head camera shows it well"
+        for board, placement in sorted({t.board for t in images} - set(boards))
+    ]
     estimate = Estimate(
         {n: cameras[n] for n in views}, rover_from_board=boards, joints_rad=np.zeros((attitudes, 2))
     )
-    return BenchStart(
-        estimate,
-        frozenset(doubtful),
-        tuple(notes),
-        {board: frozenset(names) for board, names in elsewhere.items() if len(names) >= FEWEST_ELSEWHERE},
-    )
+    return BenchStart(estimate, frozenset(doubtful), tuple(notes))
+
+
+def _refuse_two_places(shown: Sequence[ImageTerm], elsewhere: set[str]) -> None:
+    """Raise for the images of a board of which some have it at another place."""
+    there = np.array([t.name in elsewhere for t in shown])
+    board, placement = shown[0].board
+    # A picture that says nothing clear may lie on either side: the change is where it divides best.
+    cut, wrong = best_cut(there)
+    if wrong > TURNABOUTS * there.sum():
+        first = [shown[i + 1].name for i in np.flatnonzero(there[1:] != there[:-1])[:3]]
+        raise SomethingChanged(
+            f"board {board} of placement {placement} stands at two places, now at one and now at the "
+            f"other (pictures {', '.join(first)} and others). Two boards have the same ids, or it was "
+            "moved and put back. Leave one board only, or print the other with other ids (first_id)"
+        )
+    raise BenchNotFitted(board_moved(board, placement, shown[cut - 1].name, shown[cut].name))
+
+
+def best_cut(there: np.ndarray) -> tuple[int, int]:
+    """Return before which of a row (n,) it changes sides, and for how many of them that is wrong."""
+    cuts = range(len(there) + 1)
+    wrong = [min((~there[:k]).sum() + there[k:].sum(), there[:k].sum() + (~there[k:]).sum()) for k in cuts]
+    return int(np.argmin(wrong)), int(min(wrong))
 
 
 def _refuse_still(name: str, images: Sequence[ImageTerm]) -> None:

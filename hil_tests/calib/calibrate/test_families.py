@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from calib.calibrate.bench.problem import bench_terms
+from calib.calibrate.bench import bench_terms
 from calib.calibrate.families import FamilyScore, compare_families, earned
 from hil_tests.support.sim_survey.bench import BenchCamera, BenchPlan, simulate_bench
 

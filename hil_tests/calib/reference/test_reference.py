@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.adjust.result import FittedRig
 from calib.adjust.uncertainty import pixel_covariance
-from calib.calibrate.bench.fit import fit_bench
+from calib.calibrate.bench import fit_bench
 from calib.calibrate.body import fit_body_pose
 from calib.calibrate.paper import fit_paper
 from calib.calibrate.survey import fit_joint

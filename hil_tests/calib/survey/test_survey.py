@@ -70,7 +70,21 @@ REFUSALS: dict[str, Refusal] = {
     "another schema": ("survey", "survey/1", "survey/2", "schema", "'mastctl/survey/1' is expected"),
     "a key is missing": ("survey", "  spacing_m: 0.08\n", "", "board.spacing_m", "missing"),
     "board key": ("survey", "spacing_m", "spacing", "board.spacing", "nearest known is 'spacing_m'"),
+    "no float's sigma": (
+        "survey",
+        "station_m: 0.001",
+        "station_m: 1e-320",
+        "sigma.station_m",
+        "from 1e-09",
+    ),
     "zero spacing": ("survey", "spacing_m: 0.08", "spacing_m: 0", "board.spacing_m", "above 0"),
+    "no float's square": (
+        "survey",
+        "{station_m: 0.001",
+        "{joint_rad: 1.0e-320, station_m: 0.001",
+        "sigma.joint_rad",
+        "0 or at least 1e-09",
+    ),
     "dots touch": ("survey", "dot_diameter_m: 0.04", "dot_diameter_m: 0.08", "board.dot_diameter_m", "less"),
     "two tapes": ("survey", ", c: [-0.2, 0.2, 0]", "", "board.tapes_in_board_m", "2 tapes"),
     "tapes on a line": (

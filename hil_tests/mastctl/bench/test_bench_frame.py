@@ -12,8 +12,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calib.adjust.result import BenchCalibration
-from calib.calibrate.bench.fit import fit_bench
-from calib.calibrate.bench.problem import BenchOptions
+from calib.calibrate.bench import fit_bench
 from calib.calibrate.starts.bench import BenchNotFitted
 from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.rig import Mast, Rig
@@ -125,10 +124,10 @@ def test_a_placement_that_moved_is_left_out_with_a_sentence(
     survey = read_survey(folder)
     whole = frame.fit_bench  # type: ignore[attr-defined]
 
-    def fits_only_without_p1(survey: Survey, options: BenchOptions) -> BenchCalibration:
+    def fits_only_without_p1(survey: Survey) -> BenchCalibration:
         if any(image.placement == "p1" for image in survey.images):
             raise BenchNotFitted("the fit leaves 24.6 times the stated noise of a corner")
-        return whole(survey, options)
+        return whole(survey)
 
     monkeypatch.setattr(frame, "fit_bench", fits_only_without_p1)
     with pytest.raises(BenchNotFitted, match=r"24\.6 times"):
