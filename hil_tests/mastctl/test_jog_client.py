@@ -79,7 +79,7 @@ def test_the_command_turns_for_some_seconds_and_says_where_it_let_go(
 ) -> None:
     words = ["point", "--rates", "0.1", "-0.05", "--seconds", "0.6", "--url", pair[0].url]
     assert main(words) == 0
-    assert capsys.readouterr().out.startswith("released at pan +0.")
+    assert capsys.readouterr().out.startswith("released at pan rad 0.")
     assert len(moves(pair[1])) > 1
 
 

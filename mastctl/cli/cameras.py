@@ -9,8 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli.daemon import DAEMON, client_of
-from mastctl.cli.options import command, finite_number, option
+from mastctl.cli.options import command, option
 from mastctl.cli.output import Answer, Shown, WrongUse, cell, tables_of
 
 if TYPE_CHECKING:
@@ -227,38 +226,6 @@ def camera_focus(args: argparse.Namespace) -> Answer:
                 break
             time.sleep(0.5)
     return Answer({"sharpness": seen, "best": best}, ())
-
-
-def _change(text: str) -> tuple[str, float]:
-    """Read a change of a setting (argparse ``type``)."""
-    from drivers.interfaces import SETTINGS  # brings numpy, which no --help needs
-
-    name, sign, value = text.partition("=")
-    if not sign or name not in SETTINGS:
-        expected = f"NAME=VALUE is expected, with the name one of {', '.join(SETTINGS)}"
-        raise argparse.ArgumentTypeError(f"{text!r} where {expected}")
-    return name, finite_number(value)
-
-
-@command(
-    "camera settings",
-    option("CAMERA", "the camera's name in the configuration"),
-    option("[NAME=VALUE...]", "as exposure_s=0.004 or gain=20", dest="changes", type=_change),
-    *DAEMON,
-    help="show a daemon's camera's exposure, gain, white balance and focus, or change them",
-    example="navcam_left exposure_s=0.004 gain=20",
-)
-def camera_settings(args: argparse.Namespace) -> Answer:
-    """Return the settings of a camera, after the changes."""
-    with client_of(args) as client:
-        if args.changes:
-            answer = client.set_camera(args.camera, **dict(args.changes))
-        else:
-            answer = client.camera_settings(args.camera)
-    if not answer["settings"]:
-        return Answer(answer, f"nothing of {answer['camera']} can be changed while it runs")
-    notes = [*answer["notes"], *(["an operation keeps them as they are"] if answer["held"] else [])]
-    return Answer(answer, [*tables_of({"settings": answer["settings"]}), *notes])
 
 
 def camera_driver() -> tuple[str, Driver]:

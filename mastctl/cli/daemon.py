@@ -120,19 +120,13 @@ def followed(client: Client, operation_id: str, as_json: bool, timeout_s: float)
     """Wait for an operation, and show its steps to a person meanwhile."""
     if as_json:
         return client.wait(operation_id, timeout_s)
-    from rich.console import Console
-    from rich.text import Text
-
-    console = Console(stderr=True)
 
     def show(step: StepTold) -> None:
-        mark = "✓" if step.get("state") == "done" else "✗"
-        line = f"  {mark} {step.get('name')} ({step.get('duration_s') or 0.0:.2f} s)"
-        console.print(Text(output.one_line(line)))
+        mark = "✓" if step["state"] == "done" else "✗"
+        output.tell(f"{mark} {step['name']} ({step['duration_s']:.2f} s)")
 
     try:
-        with console.status(f"operation {operation_id}"):
-            return client.wait(operation_id, timeout_s, show)
+        return client.wait(operation_id, timeout_s, show)
     except KeyboardInterrupt:
         output.tell(f"operation {operation_id} goes on; 'mastctl stop' stops it")
         raise

@@ -34,15 +34,15 @@ OVERVIEW: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "run": ("service", "run the daemon; its address is a line on stdout when it is ready"),
         "status": ("service", "show the state of a daemon, its operations or events"),
         "point": ("steering", "point a camera at something and measure the residual, or jog"),
-        "track": ("steering", "follow a target while the rover moves"),
+        "track": ("steering requests", "follow a target while the rover moves"),
         "snapshot": ("service", "take a picture and write it to a file"),
-        "record": ("record", "begin and end a recording; list, inspect, repair and replay them"),
+        "record": ("record requests", "begin and end a recording; list, inspect, repair and replay them"),
         "stop": ("stop", "stop the mast at once; --without-daemon if that is dead"),
         "estop": ("stop", "stop the mast at once; nothing moves it until 'mastctl reset'"),
         "reset": ("stop", "release an emergency stop; nothing moves by that"),
     },
     "geometry, on files": {
-        "camera": ("camera_files cameras camera_sync", "camera files, and cameras on this machine"),
+        "camera": ("camera_files cameras camera_sync requests", "camera files, and cameras on this machine"),
         "solve": ("geometry", "the true joint angles that bring a target onto a pixel"),
         "triangulate": ("geometry", "the point that a stereo pair sees, with covariance"),
         "handoff": ("geometry", "where a target seen by one stereo pair falls in another"),
@@ -56,7 +56,7 @@ OVERVIEW: Mapping[str, Mapping[str, tuple[str, str]]] = {
     },
     "a rig of your own": {
         "rig": (
-            "rig administration servos sim sentinel",
+            "rig requests servos sim sentinel",
             "write a rig's files; its servos, lease, tokens, mast file, drift",
         ),
         "schema": ("rig", "print the JSON Schema of a file that people write"),

@@ -12,25 +12,14 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from mastctl.report import tables
-
 if TYPE_CHECKING:
     from rich.progress import Progress
 
 
 class CommandError(Exception):
-    """A command that failed.
+    """A command that failed: ``code`` for programs, one plain sentence, and more ``detail``, which is JSON.
 
-    Parameters
-    ----------
-    code
-        For programs, ``snake_case``.
-    message
-        One plain sentence.
-    exit_code
-        2 for wrong use or bad input, 1 for a failure.
-    detail
-        More for programs; must be JSON.
+    ``exit_code`` is 2 for wrong use or bad input, 1 for a failure.
     """
 
     def __init__(
@@ -49,11 +38,6 @@ class WrongUse(CommandError):
         super().__init__("wrong_use", message, exit_code=2)
 
 
-def print_json(document: Mapping[str, Any]) -> None:
-    """Write one JSON document to stdout; a value that is not finite is the caller's defect (ValueError)."""
-    sys.stdout.write(json.dumps(document, allow_nan=False) + "\n")
-
-
 class Shown(NamedTuple):
     """A table for people, with a title and notes under it."""
 
@@ -64,16 +48,9 @@ class Shown(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """The result of a command.
+    """The result of a command: the JSON document for programs, what people see, and the exit code.
 
-    Attributes
-    ----------
-    document
-        For programs: the one JSON document.
-    shown
-        For people: a line, or lines and tables; None shows the document as `tables_of` has it.
-    code
-        The exit code.
+    ``shown`` is a line or a table, or several; None shows the whole document.
     """
 
     document: Mapping[str, Any]
@@ -86,23 +63,40 @@ def show(args: argparse.Namespace, answer: Answer) -> int:
     if args.json:
         from mastctl.as_json import as_json
 
-        print_json(as_json(answer.document))
+        _print_json(as_json(answer.document))
     else:
-        shown = answer.shown
-        for one in (
-            tables_of(answer.document)
-            if shown is None
-            else [shown]
-            if isinstance(shown, (str, Shown))
-            else shown
-        ):
+        shown = tables_of(answer.document) if answer.shown is None else answer.shown
+        for one in [shown] if isinstance(shown, (str, Shown)) else shown:
             if isinstance(one, Shown):
-                print_table(*one)
+                _print_table(one)
             else:
                 indent = len(one) - len(one.lstrip(" "))
                 sys.stdout.write(" " * indent + one_line(one) + "\n")
     sys.stdout.flush()
     return answer.code
+
+
+def chosen(document: Mapping[str, Any], keys: str) -> dict[str, Any]:
+    """Return the values at these keys, those that are not there or null left out.
+
+    ``mast.file`` is a value of a record in the document, or of each record of a list in it;
+    ``cameras.*.age_s`` is one of each record in ``cameras``.
+    """
+    found: dict[str, Any] = {}
+    for key in keys.split():
+        name, _, rest = key.partition(".")
+        if name == "*":
+            found |= {each: found.get(each, {}) | chosen(inner, rest) for each, inner in document.items()}
+            continue
+        value = document.get(name)
+        if rest and isinstance(value, Mapping):
+            found[name] = found.get(name, {}) | chosen(value, rest)
+        elif rest and isinstance(value, list):
+            before = found.get(name) or [{} for _ in value]
+            found[name] = [row | chosen(one, rest) for row, one in zip(before, value, strict=True)]
+        elif not rest and value not in (None, "", [], {}):
+            found[name] = value
+    return {name: value for name, value in found.items() if value not in ([], {})}
 
 
 def tables_of(document: Mapping[str, Any], title: str = "") -> list[Shown]:
@@ -138,7 +132,7 @@ def _plain(key: str) -> str:
 
 
 def cell(value: Any) -> str:
-    """Return a value of a record for a cell of a table."""
+    """Return a value of a record for a cell of a table, or for a line."""
     if value is None or value == "" or value == [] or value == {}:
         return "-"
     if isinstance(value, bool):
@@ -146,29 +140,29 @@ def cell(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {cell(inner)}" for key, inner in value.items())
+        return ", ".join(f"{_plain(str(key))} {cell(inner)}" for key, inner in value.items())
     if isinstance(value, (list, tuple)):
         return ", ".join(map(cell, value))
     return one_line(str(value))
 
 
-def print_table(
-    title: str, columns: Sequence[str], rows: Iterable[Sequence[str]], notes: Sequence[str] = ()
-) -> None:
+def _print_table(shown: Shown) -> None:
     """Write a table to stdout, numbers to the right and texts to the left, notes under it."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    rows = list(rows)
-    table = Table(title=Text(title), title_justify="left", show_header=any(columns))
-    for column, numeric in zip(columns, tables.Table(columns, rows).numeric, strict=True):
+    from mastctl.report import tables
+
+    rows = list(shown.rows)
+    table = Table(title=Text(shown.title), title_justify="left", show_header=any(shown.columns))
+    for column, numeric in zip(shown.columns, tables.Table(shown.columns, rows).numeric, strict=True):
         table.add_column(Text(column), justify="right" if numeric else "left", overflow="fold")
     for row in rows:
         table.add_row(*(Text(one) for one in row))
     console = Console(file=sys.stdout, soft_wrap=True)
     console.print(table)
-    for note in notes:
+    for note in shown.notes:
         console.print(Text(note))
 
 
@@ -191,15 +185,20 @@ def refuse(error: BaseException, as_json: bool) -> int:
         body: dict[str, Any] = {"code": known.code, "message": message}
         if known.detail:
             body["detail"] = dict(known.detail)
-        print_json({"error": body})
+        _print_json({"error": body})
         sys.stdout.flush()
     else:
         sys.stderr.write(f"mastctl: {message}\n")
     return known.exit_code
 
 
+def _print_json(document: Mapping[str, Any]) -> None:
+    """Write one JSON document; a value that is not finite is the caller's defect (ValueError)."""
+    sys.stdout.write(json.dumps(document, allow_nan=False) + "\n")
+
+
 def as_command_error(error: BaseException) -> CommandError:
-    """Return what a refusal says to the outside: code, message, exit code.
+    """Return an error as a refusal with code, message and exit code.
 
     Bad files and bad options end with 2, everything else with 1. An error that carries a ``code`` keeps it.
     An unforeseen error is ``internal``: its type and text on one line.
@@ -215,25 +214,18 @@ def as_command_error(error: BaseException) -> CommandError:
         return CommandError("unreachable", str(error), 1, {"reason": error.code})
     if isinstance(error, BadOptions):
         return CommandError("bad_options", str(error), 2)
-    if isinstance(error, (CalibError, DriverError)) or isinstance(getattr(error, "code", None), str):
-        detail = getattr(error, "detail", None)
+    code, detail = getattr(error, "code", None), getattr(error, "detail", None)
+    if isinstance(error, (CalibError, DriverError)) or isinstance(code, str):
+        name = type(error).__name__
+        snake = "".join(f"_{c.lower()}" if c.isupper() and i else c.lower() for i, c in enumerate(name))
         detail = detail if isinstance(detail, Mapping) else None
-        return CommandError(_code_of(error), str(error), int(getattr(error, "exit_code", 1)), detail)
+        return CommandError(code or snake, str(error), int(getattr(error, "exit_code", 1)), detail)
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename is not None else ""
         return CommandError("file_system", f"{where}{error.strerror or error}", 1)
     if isinstance(error, MemoryError):
         return CommandError("out_of_memory", "not enough memory for this input", 1)
     return CommandError("internal", f"a defect of the program: {type(error).__name__}: {error}", 1)
-
-
-def _code_of(error: BaseException) -> str:
-    """The error's own code, else its class name in snake_case."""
-    code = getattr(error, "code", None)
-    if isinstance(code, str) and code:
-        return code
-    name = type(error).__name__
-    return "".join(f"_{c.lower()}" if c.isupper() and i else c.lower() for i, c in enumerate(name))
 
 
 def progress_bar(quiet: bool) -> Progress:
@@ -254,41 +246,27 @@ def waiting(quiet: bool, what: str) -> AbstractContextManager[Any]:
 
 def check_file(path: Path, option: str) -> None:
     """Refuse a file that cannot be written. Raises CommandError."""
-    try:
-        target = path.resolve()
-        if not target.parent.is_dir():
-            raise unusable(f"{option} {path}", f"there is no folder {path.parent}; make it first")
-        if target.is_dir():
-            raise unusable(f"{option} {path}", "is a folder; a file is expected")
-        if target.exists() and not target.is_file():
-            raise unusable(f"{option} {path}", "is no regular file; a file is expected")
-        _try_to_write(target.parent, f"{option} {path}")
-    except (OSError, ValueError) as error:
-        raise unusable(f"{option} {path}", str(error)) from None
+    target = path.resolve()
+    if target.exists() and not target.is_file():
+        raise unusable(f"{option} {path}", "is a folder or a device; a file is expected")
+    if not target.parent.is_dir():
+        raise unusable(f"{option} {path}", f"there is no folder {path.parent}; make it first")
+    check_folder(target.parent, f"{option} {path}:")
 
 
 def check_folder(path: Path | None, option: str) -> None:
     """Refuse a folder that cannot be made or written to; None is no folder. Raises CommandError."""
     if path is None:
         return
+    folder = path.resolve()
     try:
-        folder = path.resolve()
         while not folder.exists() and folder != folder.parent:
             folder = folder.parent
-        if not folder.is_dir():
-            raise unusable(f"{option} {path}", f"{folder} is a file; a folder is expected")
-        _try_to_write(folder, f"{option} {path}")
-    except (OSError, ValueError) as error:
-        raise unusable(f"{option} {path}", str(error)) from None
-
-
-def _try_to_write(folder: Path, what: str) -> None:
-    """Write a nameless file there: permissions alone do not show it (read-only disks, root)."""
-    try:
-        with tempfile.TemporaryFile(dir=folder):
+        with tempfile.TemporaryFile(dir=folder):  # permissions alone do not show it (read-only disks, root)
             pass
-    except OSError as error:
-        raise unusable(what, f"nothing can be written to {folder}: {error.strerror or error}") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise unusable(f"{option} {path}", f"nothing can be written to {folder}: {reason}") from None
 
 
 def user_name(uid: int) -> str:

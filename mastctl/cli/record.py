@@ -1,4 +1,4 @@
-"""``mastctl record``: begin, end, list, inspect, repair and replay recordings."""
+"""``mastctl record``: inspect, repair and replay recordings; `mastctl.cli.requests` has the rest."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli.daemon import DAEMON, client_of, queue_output
+from mastctl.cli.daemon import queue_output
 from mastctl.cli.options import command, option
 from mastctl.cli.output import Answer, Shown, WrongUse, tables_of
-from mastctl.cli.service import serve_config
+from mastctl.cli.service import LISTEN, serve_config
 
 if TYPE_CHECKING:
     from mastctl.recorder.recorded import Recording
@@ -20,65 +20,14 @@ if TYPE_CHECKING:
 RECORDING = option("FILE", "an MCAP file, or a folder of segments")
 
 
-@command(
-    "record start",
-    option("[NAME]", "part of the file's name", default=""),
-    *DAEMON,
-    help="have the daemon record until 'record stop'",
-    example="afternoon",
-)
-def _start(args: argparse.Namespace) -> Answer:
-    with client_of(args) as client:
-        found = client.start_recording(args.name)
-    return Answer(found, f"recording {found['run']} in {found['folder']}; 'mastctl record stop' ends it")
-
-
-@command("record stop", *DAEMON, help="end the recording that 'record start' began")
-def _stop(args: argparse.Namespace) -> Answer:
-    with client_of(args) as client:
-        found = client.stop_recording()
-    return Answer(found, f"{found['file']}: {found['size_mb']:.1f} MB{_dropped(found['dropped'])}")
-
-
-@command("record list", *DAEMON, help="list the daemon's recordings: runs, what faults kept, the ring")
-def _list(args: argparse.Namespace) -> Answer:
-    with client_of(args) as client:
-        found = client.recordings()
-    rows = [
-        (one["kind"], one["name"], f"{one['size_mb']:.1f}", str(one["files"])) for one in found["recordings"]
-    ]
-    now = found["recorder"]
-    notes = [f"now: {now['run'] or now['file'] or 'nothing is recorded'}{_dropped(now['dropped'])}"]
-    notes += [now["fault"]] if now["fault"] else []
-    return Answer(
-        found, Shown(f"recordings in {now['folder']}", ("kind", "name", "MB", "files"), rows, notes)
-    )
-
-
-def _dropped(dropped: dict[str, int]) -> str:
-    count = sum(dropped.values())
-    return f", {count} values were dropped or overtaken by newer ones" if count else ""
-
-
 @command("record show", RECORDING, help="say what a recording holds, whole or not", example="afternoon.mcap")
 def _show(args: argparse.Namespace) -> Answer:
     from mastctl.recorder.recorded import read_whole
 
-    recording = read_whole(args.file)
-    found = recording.summary()
-    return Answer(found, [*tables_of(found, str(args.file)), _state(recording)])
-
-
-def _state(recording: Recording) -> str:
-    """Whether it is whole, and the command that repairs it."""
-    found = recording.summary()
-    if found["complete"] and not found["damaged"]:
-        return "whole"
-    parts = [f"{found['damaged']} damaged chunks"] if found["damaged"] else []
-    parts += (
-        [] if found["complete"] else [f"not ended, {found['left_over_bytes']} bytes at its end are no record"]
-    )
-    return f"{'; '.join(parts)}; 'mastctl record repair {recording.path}' writes what is whole anew"
+    found = read_whole(args.file).summary()
+    whole = found["complete"] and not found["damaged"]
+    state = "whole" if whole else f"'mastctl record repair {args.file}' writes what is whole anew"
+    return Answer(found, [*tables_of(found, str(args.file)), state])
 
 
 @command(
@@ -93,13 +42,8 @@ def _repair(args: argparse.Namespace) -> Answer:
     from mastctl.recorder.repair import repair
 
     out = args.out or args.file.with_name(f"{args.file.stem}.repaired.mcap")
-    found = repair(recording_files(args.file), out)
-    document = {"file": str(out), **found, "was_complete": found["complete"]}
-    del document["complete"]
-    damaged, left_over = found["damaged"], found["left_over_bytes"]
-    lost = f", {damaged} damaged chunks were left out" if damaged else ""
-    lost += f", {left_over} bytes at the end were no record" if left_over else ""
-    return Answer(document, f"{out}: {found['messages']} messages, {found['seconds']:.1f} s{lost}")
+    found = dict(repair(recording_files(args.file), out))
+    return Answer({"file": str(out), "was_complete": found.pop("complete"), **found})
 
 
 @command(
@@ -107,7 +51,7 @@ def _repair(args: argparse.Namespace) -> Answer:
     RECORDING,
     option("--mast OTHER.yaml", "evaluate as if this mast file had been used"),
     option("--report DIR", "where the what-if's page goes"),
-    option("--listen HOST:PORT", "where to serve (default 127.0.0.1:8420; port 0: any)"),
+    LISTEN,
     help="serve a recording, or evaluate its pointings again with another mast file",
     example="afternoon.mcap --mast other.yaml",
 )
@@ -129,23 +73,12 @@ def _served(args: argparse.Namespace) -> int:
     from mastctl.config import load_config
     from mastctl.recorder.recorded import read_whole, replay_files
 
-    listen = _listen(args.listen)
     queue_output()
     with tempfile.TemporaryDirectory(prefix="mastctl-replay-") as folder:
-        path = replay_files(read_whole(args.file), Path(folder), listen)
+        path = replay_files(read_whole(args.file), Path(folder), {})
         with suppress(KeyboardInterrupt), signals.raised():
             serve_config(load_config(path), args)
     return 0
-
-
-def _listen(text: str | None) -> dict[str, Any]:
-    """``HOST:PORT`` as the configuration has it."""
-    if text is None:
-        return {}
-    host, _, port = text.rpartition(":")
-    if not host or not port.isdecimal() or int(port) > 65535:
-        raise WrongUse(f"--listen is '{text}' where HOST:PORT is expected, e.g. 127.0.0.1:8421")
-    return {"host": host.strip("[]"), "port": int(port)}
 
 
 def _what_if(args: argparse.Namespace, recording: Recording) -> Answer:

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 from mastctl.cli.daemon import DAEMON, TIMEOUT, client_of, followed
 from mastctl.cli.options import angle_rad, command, finite_number, one_of, option
-from mastctl.cli.output import Answer, CommandError, WrongUse
-from mastctl.cli.service import pointings_shown, show_each, track_line
+from mastctl.cli.output import Answer, CommandError, WrongUse, cell, chosen
+from mastctl.cli.requests import TRACK
+from mastctl.cli.service import operation_shown, show_each
 
 if TYPE_CHECKING:
     from mastctl.answers import OperationTold, TrackTold
@@ -76,10 +77,9 @@ def _point(args: argparse.Namespace) -> Answer:
     with client_of(args) as client:
         operation_id = client.point(**request, **_target(args, client))
         if args.no_wait:
-            return Answer({"id": operation_id}, f"operation {operation_id}")
-        record = followed(client, operation_id, args.json, args.timeout)
-    _check_done(record)
-    return Answer(record, pointings_shown(record))
+            return Answer({"id": operation_id}, operation_id)
+        record = _done(args, client, operation_id)
+    return Answer(record, operation_shown(record))
 
 
 def _check_target(args: argparse.Namespace) -> None:
@@ -113,10 +113,11 @@ def _pixel(option: str, texts: list[str]) -> list[float]:
         raise WrongUse(f"{option}: {error}") from None
 
 
-def _check_done(record: OperationTold) -> None:
-    """Pass an operation that ended as done. Raises CommandError with the operation's error."""
+def _done(args: argparse.Namespace, client: Client, operation_id: str) -> OperationTold:
+    """Wait for an operation that has to end as done. Raises CommandError with its error."""
+    record = followed(client, operation_id, args.json, args.timeout)
     if record["state"] == "done":
-        return
+        return record
     message = f"operation {record['id']} ended as {record['state']}"
     error = record["error"] or {"code": record["state"], "message": message}
     raise CommandError(error["code"], error["message"], detail={"operation": record})
@@ -134,8 +135,7 @@ def _jog(args: argparse.Namespace) -> Answer:
                 stopped_by = jog.held
         joints = client.status()["joints"]
     ended = {name: None if joints is None else joints[name] for name in ("pan_rad", "tilt_rad")}
-    where = f" at pan {ended['pan_rad']:+.4f}, tilt {ended['tilt_rad']:+.4f} rad" if joints else ""
-    return Answer({**ended, "held": stopped_by}, "; ".join([f"released{where}", *stopped_by.values()]))
+    return Answer({**ended, "held": stopped_by}, f"released at {cell(ended | stopped_by)}")
 
 
 @command(
@@ -152,15 +152,8 @@ def _start(args: argparse.Namespace) -> Answer:
     _check_target(args)
     with client_of(args) as client:
         operation_id = client.start_track(**_target(args, client))
-        _check_done(followed(client, operation_id, args.json, args.timeout))
+        _done(args, client, operation_id)
         return _track(client.wait_track(operation_id, args.timeout))
-
-
-@command("track status", *DAEMON, help="show the track, and offsets found by hand-offs")
-def _status(args: argparse.Namespace) -> Answer:
-    with client_of(args) as client:
-        track = client.track()
-    return Answer(track, [track_line(track), *(one["sentence"] for one in track["self_check"]["offsets"])])
 
 
 @command(
@@ -198,10 +191,10 @@ def _watch(args: argparse.Namespace) -> int:
 )
 def _pose(args: argparse.Namespace) -> Answer:
     with client_of(args) as client:
-        sigma = None if args.sigma is None else (args.sigma[0], args.sigma[1])
         answer = client.pose(
-            args.position, args.quaternion, sigma=sigma, time_s=args.time, look=not args.no_look
-        )
+            args.position, args.quaternion, sigma=args.sigma and tuple(args.sigma), time_s=args.time,
+            look=not args.no_look,
+        )  # fmt: skip
         return _measured(args, client, answer["operation"])
 
 
@@ -209,12 +202,6 @@ def _pose(args: argparse.Namespace) -> Answer:
 def _look(args: argparse.Namespace) -> Answer:
     with client_of(args) as client:
         return _measured(args, client, client.look())
-
-
-@command("track stop", *DAEMON, help="end the track")
-def _stop(args: argparse.Namespace) -> Answer:
-    with client_of(args) as client:
-        return _track(client.stop_track())
 
 
 def _measured(args: argparse.Namespace, client: Client, operation_id: str | None) -> Answer:
@@ -225,4 +212,4 @@ def _measured(args: argparse.Namespace, client: Client, operation_id: str | None
 
 
 def _track(track: TrackTold) -> Answer:
-    return Answer(track, track_line(track))
+    return Answer(track, cell(chosen(track, TRACK)))

@@ -39,9 +39,9 @@ def test_operations_are_listed_shown_and_watched(
 ) -> None:
     url = pair[0].url
     table = said(capsys, "status", "--operations", "--url", url)
-    assert operation in table and "pan 0.25" in table and "+0.250, -0.500" in table
+    assert operation in table and "pan rad 0.25" in table and "0.25, -0.5" in table
     shown = said(capsys, "status", "--operation", operation, "--url", url)
-    assert "✓ look" in shown and "✓ measure" in shown and "done after measure" in shown
+    assert operation in shown and "look" in shown and "measure" in shown and "done" in shown
     assert (
         json.loads(said(capsys, "status", "--operation", operation, "--wait", "60", "--url", url, "--json"))[
             "id"
@@ -49,7 +49,7 @@ def test_operations_are_listed_shown_and_watched(
         == operation
     )
     line = said(capsys, "status", "--events", "operation", "--count", "1", "--url", url)
-    assert line == f"operation {operation}: point at pan 0.25, tilt -0.5 rad, done after measure\n"
+    assert line.startswith(f"operation {operation}: state done, request pan rad 0.25, tilt rad -0.5")
     assert main(["status", "--operation", "nothing", "--url", url]) == 2
     assert "operation nothing is not known" in capsys.readouterr().err
 
@@ -57,7 +57,8 @@ def test_operations_are_listed_shown_and_watched(
 def test_events_are_a_line_each(pair: BOTH, operation: str, capsys: pytest.CaptureFixture[str]) -> None:
     url = pair[0].url
     assert (
-        said(capsys, "status", "--events", "state", "--count", "1", "--url", url) == "state machine: ready\n"
+        said(capsys, "status", "--events", "state", "--count", "1", "--url", url)
+        == "state machine: state ready\n"
     )
     told = said(
         capsys, "status", "--events", "operation", "mast", "--count", "2", "--url", url, "--json"
@@ -88,11 +89,10 @@ def test_the_mast_file_is_shown_replaced_and_put_back(
 ) -> None:
     url = ("--url", pair[0].url)
     save_rig(rig(), tmp_path / "other.yaml")
-    shown = said(capsys, "rig", "mast", "show", "--out", str(tmp_path / "copy"), *url)
-    assert shown.startswith("little.yaml (little")
+    assert "little.yaml" in said(capsys, "rig", "mast", "show", "--out", str(tmp_path / "copy"), *url)
     assert (tmp_path / "copy").read_bytes() == (tmp_path / "little.yaml").read_bytes()
     assert said(capsys, "rig", "mast", "use", "other.yaml", *url).startswith("other.yaml (little")
-    assert ", before other.yaml" in said(capsys, "rig", "mast", "back", *url)
+    assert "before other.yaml" in said(capsys, "rig", "mast", "back", *url)
     assert main(["rig", "mast", "use", "none.yaml", *url]) == 2
 
 

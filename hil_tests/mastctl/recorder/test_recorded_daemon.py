@@ -102,7 +102,7 @@ def test_the_command_line_begins_ends_and_lists(
     ended = json.loads(capsys.readouterr().out)
     assert main(["record", "list", *url]) == 0
     shown = capsys.readouterr().out
-    assert "by-hand" in shown and "nothing is recorded" in shown
+    assert "by-hand" in shown and "recorder.run" in shown
     assert main(["record", "show", ended["file"]]) == 0
     assert "whole" in capsys.readouterr().out
 

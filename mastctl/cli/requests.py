@@ -1,0 +1,279 @@
+"""Commands that send a daemon one request and print its answer, as rows of a table; and its tokens."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from mastctl.cli import output
+from mastctl.cli.daemon import CONFIG, DAEMON, URL, client_of
+from mastctl.cli.options import GROUPS, Option, command, finite_number, option
+from mastctl.cli.output import Answer, CommandError, WrongUse, check_file, chosen, tables_of
+
+if TYPE_CHECKING:
+    from mastctl.client import Client
+    from mastctl.http.tokens import TokenList
+
+GROUPS |= {
+    "rig lease": "the lease: the right to steer the rover, and its holder",
+    "rig token": "tokens of a daemon that is reached from other machines",
+    "rig mast": "the mast file that a running daemon points by",
+    "rig fault": "the faults of a simulated rover",
+}
+
+TRACK = "state pair range_m position_m predicted operation reason self_check.offsets.sentence"
+"""What people see of a track."""
+
+FOR = option("--for S", "how long, seconds up to 3600 (default: 30, or as before)", dest="for_s")
+OWN_LEASE = (URL, CONFIG, option("--lease ID", "as 'mastctl rig lease take' prints it", required=True))
+
+
+class Request(NamedTuple):
+    """A command of one request.
+
+    People see ``line``, with keys of the answer in braces, or else its values at ``keys``, or all of it.
+    """
+
+    words: str
+    help: str
+    send: Callable[[Client, argparse.Namespace], Mapping[str, Any]]
+    options: tuple[Option, ...] = ()
+    example: str = ""
+    line: str = ""
+    keys: str = ""
+    daemon: tuple[Option, ...] = DAEMON
+
+    def run(self, args: argparse.Namespace) -> Answer:
+        """Send it and return the answer."""
+        with client_of(args) as client:
+            answer = self.send(client, args)
+        if self.line:
+            return Answer(answer, self.line.format_map(answer))
+        return Answer(answer, tables_of(chosen(answer, self.keys)) if self.keys else None)
+
+
+def _mast(client: Client, args: argparse.Namespace) -> Mapping[str, Any]:
+    """The mast files of a daemon; the one in use is written to --out, byte for byte."""
+    status = client.status()
+    if args.out is not None:
+        check_file(args.out, "--out")
+        args.out.write_bytes(client.mast_file())
+    return {"mast": status["mast"], "former_mast": status["former_mast"]}
+
+
+def _clear_faults(client: Client, args: argparse.Namespace) -> Mapping[str, Any]:
+    client.clear_faults(args.device)
+    return {"faults": client.faults()}
+
+
+def _release(client: Client, args: argparse.Namespace) -> Mapping[str, Any]:
+    client.release_lease()
+    return {"released": True}
+
+
+def _parameter(text: str) -> tuple[str, float]:
+    """Read ``NAME=VALUE`` (argparse ``type``)."""
+    name, equals, value = text.partition("=")
+    if not equals or not name.isidentifier():
+        raise argparse.ArgumentTypeError(f"'{text}' where NAME=VALUE is expected, such as sigma=8")
+    return name, finite_number(value)
+
+
+def _settings(client: Client, args: argparse.Namespace) -> Mapping[str, Any]:
+    from drivers.interfaces import SETTINGS
+
+    if not args.changes:
+        return client.camera_settings(args.camera)
+    for name, _ in args.changes:
+        if name not in SETTINGS:
+            raise WrongUse(f"'{name}' where one of {', '.join(SETTINGS)} is expected")
+    return client.set_camera(args.camera, **dict(args.changes))
+
+
+CHANGED_MAST = "{mast[file]} ({mast[name]}) is in use, before {former_mast[file]}"
+
+REQUESTS = (
+    Request("rig lease show", "show the client that steers", lambda client, _: {"control": client.control()}),
+    Request(
+        "rig lease take",
+        "acquire the lease and print its id, for --lease; with --reason from its holder",
+        lambda client, args: client.acquire_lease(args.name, args.for_s or 30.0, args.reason),
+        (
+            option("--name NAME", "the holder's name (default: user@host)"),
+            option("--reason TEXT", "take the lease from its holder, and show the holder this reason"),
+            FOR,
+        ),
+        "--for 60",
+        line="{lease_id}",
+    ),
+    Request(
+        "rig lease renew",
+        "have a lease run on from now",
+        lambda client, args: client.renew_lease(args.for_s),
+        (FOR,),
+        "--lease 0f3c --for 60",
+        keys="holder for_s until",
+        daemon=OWN_LEASE,
+    ),
+    Request(
+        "rig lease release", "let others steer", _release, (), "--lease 0f3c", "released", daemon=OWN_LEASE
+    ),
+    Request(
+        "rig mast show",
+        "show which is in use, and which was before",
+        _mast,
+        (option("--out FILE", "write the one in use to this file too, byte for byte"),),
+        "--out now.yaml",
+    ),
+    Request(
+        "rig mast use",
+        "use another of the same folder; pictures taken before are refused",
+        lambda client, args: client.use_mast(args.name),
+        (option("NAME", "its name, without a folder"),),
+        "rocky8-refined.yaml",
+        CHANGED_MAST,
+    ),
+    Request(
+        "rig mast back",
+        "go back to the one that was in use before",
+        lambda client, _: client.use_former_mast(),
+        line=CHANGED_MAST,
+    ),
+    Request("rig fault list", "show which are switched on", lambda client, _: {"faults": client.faults()}),
+    Request(
+        "rig fault set",
+        "switch one on",
+        lambda client, args: {"faults": client.set_fault(args.device, args.fault, **dict(args.parameters))},
+        (
+            option("DEVICE", "pan_tilt, a camera, ... (docs/how-to/simulation.md)"),
+            option("FAULT", "its name: off, stuck, dark, ..."),
+            option("[NAME=VALUE...]", "how much of it", dest="parameters", type=_parameter),
+        ),
+        "navcam_left dark for_s=5",
+    ),
+    Request(
+        "rig fault clear",
+        "switch those of a device off, or all",
+        _clear_faults,
+        (option("[DEVICE]", "only its faults (default: all)"),),
+        "navcam_left",
+    ),
+    Request(
+        "rig reload",
+        "have the daemon read its configuration again; all of it comes into use, or nothing",
+        lambda client, _: client.reload(),
+    ),
+    Request(
+        "record start",
+        "have the daemon record until 'record stop'",
+        lambda client, args: client.start_recording(args.name),
+        (option("[NAME]", "part of the file's name", default=""),),
+        "afternoon",
+        "recording {run} in {folder}; 'mastctl record stop' ends it",
+    ),
+    Request(
+        "record stop",
+        "end the recording that 'record start' began",
+        lambda client, _: client.stop_recording(),
+        keys="file size_mb dropped",
+    ),
+    Request(
+        "record list",
+        "list the daemon's recordings: runs, what faults kept, the ring",
+        lambda client, _: client.recordings(),
+        keys="recordings.kind recordings.name recordings.size_mb recordings.files recorder",
+    ),
+    Request(
+        "camera settings",
+        "show a daemon's camera's exposure, gain, white balance and focus, or change them",
+        _settings,
+        (
+            option("CAMERA", "the camera's name in the configuration"),
+            option("[NAME=VALUE...]", "as exposure_s=0.004 or gain=20", dest="changes", type=_parameter),
+        ),
+        "navcam_left exposure_s=0.004 gain=20",
+    ),
+    Request(
+        "track status",
+        "show the track, and offsets found by hand-offs",
+        lambda client, _: client.track(),
+        keys=TRACK,
+    ),
+    Request("track stop", "end the track", lambda client, _: client.stop_track(), keys=TRACK),
+)  # fmt: skip
+
+for _one in REQUESTS:
+    command(_one.words, *_one.options, *_one.daemon, help=_one.help, example=_one.example)(_one.run)
+
+
+TOKEN = (URL, CONFIG, option("--state FOLDER", "state folder of a daemon that does not run now"))
+
+
+@command(
+    "rig token new",
+    option("--name NAME", "the name of its user, in the record of commands", required=True),
+    option("--role view|operate|admin", "what it allows", required=True),
+    *TOKEN,
+    help="make a token and print it; it is shown once and kept nowhere",
+    example="--name wall --role view",
+)
+def _new(args: argparse.Namespace) -> Answer:
+    text = _tokens(args).new(args.name, args.role)
+    return Answer({"name": args.name, "role": args.role, "token": text}, text)
+
+
+@command("rig token list", *TOKEN, help="show names and roles of the tokens")
+def _list(args: argparse.Namespace) -> Answer:
+    return Answer({"tokens": [one.model_dump(exclude={"sha256"}) for one in _tokens(args).read() or ()]})
+
+
+@command(
+    "rig token revoke",
+    option("NAME", "as 'mastctl rig token list' shows it"),
+    *TOKEN,
+    help="let a token open nothing any more; sessions by it end too",
+    example="wall",
+)
+def _revoke(args: argparse.Namespace) -> Answer:
+    revoked = _tokens(args).revoke(args.name)
+    return Answer({"revoked": revoked.name, "role": revoked.role})
+
+
+def _tokens(args: argparse.Namespace) -> TokenList:
+    """The list that the daemon reads."""
+    from mastctl.http.tokens import LIST_NAME, TokenList
+
+    folder = args.state or _folder_of_running(args)
+    if args.state is not None and not (folder / LIST_NAME).exists():
+        missing = "no daemon has kept its state here that requires tokens; its first run makes them"
+        raise output.unusable(str(folder), missing)
+    owner = folder.stat().st_uid
+    if owner != os.geteuid():  # what root writes there the daemon could not read
+        user = output.user_name(owner)
+        message = f"{folder} belongs to {user}, whose daemon reads it: sudo -u {user} mastctl rig token ..."
+        raise CommandError("another_user", message)
+    return TokenList(folder)
+
+
+def _folder_of_running(args: argparse.Namespace) -> Path:
+    """Where the running daemon reads tokens."""
+    from mastctl.client import ClientError
+
+    with client_of(args) as client:
+        try:
+            folder = client.live().get("token_folder")
+        except ClientError as error:
+            if error.code != "no_daemon":
+                raise
+            message = (
+                f"no daemon answers at {client.url}, and only a running one knows where it reads its tokens: "
+                "start it, or name the folder of one that has run by --state FOLDER"
+            )
+            raise CommandError(error.code, message) from None
+    if folder is None:
+        message = f"the daemon at {client.url} requires no token, or is on another machine: make it there"
+        raise CommandError("no_tokens", message)
+    return Path(folder)
