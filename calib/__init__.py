@@ -24,14 +24,12 @@ if TYPE_CHECKING:
     from calib.geometry.cahvor import CameraModel as CameraModel
     from calib.geometry.handoff import Joints as Joints
     from calib.geometry.handoff import hand_off as hand_off
+    from calib.geometry.pointing import choose as choose
     from calib.geometry.pointing import solve as solve
-    from calib.geometry.pointing import solve_many as solve_many
     from calib.geometry.rig import Mast as Mast
     from calib.geometry.rig import Rig as Rig
     from calib.geometry.rig import RigCamera as RigCamera
-    from calib.geometry.solutions import choose as choose
     from calib.geometry.stereo import triangulate as triangulate
-    from calib.geometry.stereo import triangulate_many as triangulate_many
     from calib.survey.check import check_survey as check_survey
     from calib.survey.find_dots import detect_survey as detect_survey
     from calib.survey.reader import read_survey as read_survey
@@ -67,19 +65,15 @@ _MODULES = {
         "hand_off",
     ),
     "calib.geometry.pointing": (
+        "choose",
         "solve",
-        "solve_many",
     ),
     "calib.geometry.rig": (
         "Mast",
         "Rig",
         "RigCamera",
     ),
-    "calib.geometry.solutions": ("choose",),
-    "calib.geometry.stereo": (
-        "triangulate",
-        "triangulate_many",
-    ),
+    "calib.geometry.stereo": ("triangulate",),
     "calib.survey.check": ("check_survey",),
     "calib.survey.find_dots": ("detect_survey",),
     "calib.survey.reader": ("read_survey",),

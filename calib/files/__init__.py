@@ -21,10 +21,9 @@ from numpy.typing import ArrayLike
 
 from calib.errors import BadFile
 from calib.geometry.cahvor import CameraModel, Kind
+from calib.geometry.rigid import unit_vector
 
 UNKNOWN_FRAME = "unknown"
-#: A shift of a pixel by the normalisation of A and O is noted from this size on.
-SHIFT_NOTE_PX = 0.01
 #: No component of a camera model or a mast is larger; beyond it the arithmetic would overflow.
 LARGEST_COMPONENT = 1e9
 LARGEST_IMAGE_PX = 65536
@@ -165,27 +164,22 @@ def build_model(
         linearity = fixed
     try:
         with np.errstate(all="ignore"):
-            model, shift_px = CameraModel.normalised(
+            units = {letter: unit_vector(arrays[letter]) for letter in "AO" if letter in arrays}
+            model = CameraModel(
                 kind,
                 size_px,
-                arrays["C"],
-                arrays["A"],
-                arrays["H"],
-                arrays["V"],
-                arrays.get("O"),
-                arrays.get("R"),
-                arrays.get("E"),
-                cahvore_type,
-                1.0 if linearity is None else linearity,
+                cahvore_type=cahvore_type,
+                linearity=1.0 if linearity is None else linearity,
+                **arrays | units,
             )
     except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
         raise BadFile(path, place, f"is no usable camera model: {error}") from None
-    if not shift_px <= SHIFT_NOTE_PX:
-        sizes = " and ".join(
-            f"|{letter}| = {np.linalg.norm(arrays[letter]):.6g}" for letter in "AO" if letter in arrays
-        )
-        moved = f"by up to {shift_px:.2g} px" if shift_px < LARGEST_IMAGE_PX else "out of the image"
-        notes.append(f"{where}{sizes} made 1, which moves pixels {moved}")
+    lengths = {letter: float(np.linalg.norm(arrays[letter])) for letter in units}
+    off = max(abs(length - 1.0) for length in lengths.values())
+    # Labels print six digits; a hundred-thousandth is 0.01 px at x = 1000.
+    if off > 1e-5:
+        sizes = " and ".join(f"|{letter}| = {length:.6g}" for letter, length in lengths.items())
+        notes.append(f"{where}{sizes} made 1, which moves pixels by about {100 * off:.2g} %")
     return model, tuple(notes)
 
 

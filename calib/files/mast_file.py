@@ -18,7 +18,6 @@ from pydantic import AfterValidator, Field, WithJsonSchema, model_validator
 from calib.errors import BadFile
 from calib.files import (
     LARGEST_IMAGE_PX,
-    SHIFT_NOTE_PX,
     CameraFile,
     blind_notes,
     build_model,
@@ -393,7 +392,7 @@ def _opencv_model(
         raise BadFile(path, place, f"is no usable camera: {error}") from None
     if not model.project(model.C + model.A)[1]:
         raise BadFile(path, at("distortion"), "the lens folds at its axis: no image can be formed")
-    if (shift_px := off * max(abs(matrix[0, 0]), abs(matrix[1, 1]))) > SHIFT_NOTE_PX:
+    if (shift_px := off * max(abs(matrix[0, 0]), abs(matrix[1, 1]))) > 0.01:
         notes = (f"{place or 'camera'}: 'rotation' made one, which moves pixels by up to {shift_px:.2g} px",)
     return model, notes
 

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from calib.geometry.lenses.opencv import OpencvLens
 from calib.geometry.lenses.round import RoundLens
-from calib.geometry.projection import Lens, Projection, project_as_published
+from calib.geometry.projection import Lens, Projection
 from calib.geometry.rigid import FloatArray, ReadOnlyArrays, Rigid, frozen_array, tangents, turning
 
 Kind = Literal[
@@ -71,7 +71,7 @@ def letters_of(kind: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class CameraModel(ReadOnlyArrays):
-    """One camera; A and O are unit vectors (see ``normalised``).
+    """One camera; A and O are unit vectors.
 
     Attributes
     ----------
@@ -160,7 +160,7 @@ class CameraModel(ReadOnlyArrays):
         if not 1.0 + self.R[0] > 0.0:
             raise ValueError(f"R begins with {self.R[0]:g} where a number above -1 is expected")
         hva = np.array([self.H, self.V, self.A])
-        lengths = np.sqrt(np.einsum("ij,ij->i", hva, hva))
+        lengths = np.linalg.norm(hva, axis=1)
         # Relative volume of H, V, A below which they lie in one plane.
         if not lengths.all() or not abs(np.linalg.det(hva / lengths[:, None])) > 1e-12:
             raise ValueError("H, V and A lie in one plane where three directions are expected")
@@ -216,58 +216,6 @@ class CameraModel(ReadOnlyArrays):
             r, e = tuple(self.R.tolist()), tuple(self.E.tolist())
             lens = RoundLens(r, e, self.kind == "CAHVORE", self.linearity, slope)
         self._set("projection", Projection(lens, pixel_from_slope, slope_from_pixel))
-
-    @classmethod
-    def normalised(
-        cls,
-        kind: Kind,
-        size_px: tuple[int, int],
-        C: ArrayLike,
-        A: ArrayLike,
-        H: ArrayLike,
-        V: ArrayLike,
-        O: ArrayLike | None = None,  # noqa: E741
-        R: ArrayLike | None = None,
-        E: ArrayLike | None = None,
-        cahvore_type: int = 0,
-        linearity: float = 1.0,
-    ) -> tuple[CameraModel, float]:
-        """Return the model with A and O made unit vectors, and by how many pixels that moves one at most.
-
-        Arguments as the class, A and O of any length but zero (ValueError). The change is the largest over
-        the image, of points 1 m and 1 km away, against JPL's formulas with the vectors as given; infinite if
-        those give no pixel somewhere.
-        """
-        given = {"A": _vector("A", A)}
-        if O is not None and "O" in letters_of(str(kind)):
-            given["O"] = _vector("O", O)
-        units, stretched = {}, False
-        for letter, axis in given.items():
-            length = float(np.linalg.norm(axis))
-            if not 0.0 < length < inf:
-                raise ValueError(f"{letter} is {axis.tolist()} where a direction is expected")
-            # A length so close to 1 is 1: such vectors keep their bits when a file is read and written.
-            is_unit = abs(length - 1.0) <= 4e-16
-            units[letter] = axis if is_unit else axis / length
-            stretched |= not is_unit
-        vectors = {"C": C, "H": H, "V": V, "O": None, "R": R, "E": E} | units
-        model = cls(kind, size_px, cahvore_type=cahvore_type, linearity=linearity, **vectors)  # type: ignore[arg-type]
-        if not stretched or kind in FREE:
-            return model, 0.0
-        x, y = np.meshgrid(*(np.linspace(-0.5, n - 0.5, 17) for n in model.size_px))
-        pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
-        rays = model.ray(pixels)
-        letters = {letter: given.get(letter, getattr(model, letter)) for letter in "CAHVORE"}
-        if "O" not in given:
-            letters["O"] = given["A"]
-        curve = model.linearity if kind == "CAHVORE" else None
-        shift_px = 0.0
-        for range_m in (1.0, 1000.0):
-            points = rays.origins_m[rays.valid] + range_m * rays.directions[rays.valid]
-            published = project_as_published(points, linearity=curve, **letters)
-            far = np.hypot(*(published - pixels[rays.valid]).T)
-            shift_px = max(shift_px, float(np.where(np.isfinite(far), far, inf).max(initial=0.0)))
-        return model, shift_px
 
     @classmethod
     def of_matrix(
@@ -410,18 +358,9 @@ class CameraModel(ReadOnlyArrays):
         return across, down
 
     @property
-    def axes(self) -> FloatArray:
-        """(3, 3): columns are x right, y down and z along A, in the model's frame."""
-        if self.kind in FREE:
-            return self.lens_axes.T
-        across = self.H - (self.H @ self.A) * self.A
-        x = across / np.linalg.norm(across)
-        return np.stack([x, np.cross(self.A, x), self.A], axis=-1)
-
-    @property
     def pose(self) -> Rigid:
-        """Where the camera is: its ``axes`` at C."""
-        return Rigid(self.axes, self.C)
+        """frame_from_camera: x right, y down (as V says) and z along A, at C."""
+        return Rigid(self.rotation.T, self.C)
 
     def project(self, points_m: ArrayLike) -> tuple[FloatArray, np.ndarray]:
         """Return pixels (..., 2) of points (..., 3), metres in the model's frame, and which are valid (...).

@@ -1,4 +1,4 @@
-"""Exact pointing: the joint angles that bring a target onto a chosen pixel of a head camera.
+"""Exact pointing: the joint angles that bring a target onto a pixel of a head camera, and which to take.
 
 The pixel's ray (origin c, unit direction d, both in the head frame) comes from the camera model itself. So
 lens distortion, a moving entrance point, oblique H and V and a principal point off centre are all exact, for
@@ -9,7 +9,8 @@ letters are those of calib.geometry.reach.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,10 +20,19 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.reach import EDGE, Arm
 from calib.geometry.rig import Mast
 from calib.geometry.rigid import FloatArray
-from calib.geometry.solutions import Solution, Solutions, check_here, order
 
-_MOST = 4
-"""Pairs of joint angles that a target can have: as many as the quartic has roots."""
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """Joint angles that put the target on the pixel, and its range from the ray's origin.
+
+    The angles are in (-π, π] from ``solve``; ``choose`` may return them a whole turn away. The ray begins at
+    the camera's C, or its moved entrance point.
+    """
+
+    pan_rad: float
+    tilt_rad: float
+    range_m: float
 
 
 def solve(
@@ -34,28 +44,13 @@ def solve(
     from_pan_rad: float = 0.0,
     from_tilt_rad: float = 0.0,
 ) -> list[Solution]:
-    """Return every pair of joint angles that puts the target on the pixel, the best first.
+    """Return every pair of joint angles that puts a target (3,) on a pixel (2,), the best first.
 
-    Parameters
-    ----------
-    camera_in_head
-        Camera model in the head frame (a rig camera that is ``on: head``).
-    target_in_rover_m
-        (3,) target in the rover frame, metres; or (..., 3) many of them.
-    pixel_px
-        (x, y) of the wanted pixel; the image centre if left out; or (..., 2), broadcast against the targets.
-    from_pan_rad, from_tilt_rad
-        Where the head is now, for the order.
-
-    Returns
-    -------
-    list of Solution
-        For arrays of more than one axis what ``solve_many`` returns, which says so to a type checker too.
-        For one target never empty. Upright solutions (tilt within ±π/2) first, then by the larger of
-        ``|Δpan|`` and ``|Δtilt|``. The differences are plain ones, not taken round the circle: a head with a
-        cable cannot pass ±π.
-        Each has the target in front of the camera (range_m > 0). Limits are left to ``choose``. For a target
-        on the pan axis every pan does; from_pan_rad is returned.
+    Without a pixel it is the image centre. Upright solutions (tilt within ±π/2) come first, then by the
+    larger of ``|Δpan|`` and ``|Δtilt|`` from where the head is now. The differences are plain ones, not taken
+    round the circle: a head with a cable cannot pass ±π. Each has the target in front of the camera
+    (range_m > 0). Limits are left to ``choose``. For a target on the pan axis every pan does; from_pan_rad is
+    returned. Extends section IV of the paper, eqs. (11)-(25); see docs/explanation/pointing.md.
 
     Raises
     ------
@@ -64,10 +59,6 @@ def solve(
         ``too_near``: nearer than the ray can be brought, with both distances. ``bad_pixel``, ``bad_target``:
         the pixel has no ray, or the target is not three finite numbers below 1e9 m. ``parallel_axes``:
         ``|cos k|`` < 0.001. ``bad_joints``: where the head is now is not finite.
-
-    Notes
-    -----
-    Extends section IV of the paper, eqs. (11)-(25); see docs/explanation/pointing.md.
 
     Examples
     --------
@@ -82,96 +73,18 @@ def solve(
     >>> round(best.pan_rad, 6), abs(round(best.tilt_rad, 6)), round(best.range_m, 6)
     (1.570796, 0.0, 3.0)
     """
-    check_here(from_pan_rad, from_tilt_rad)
+    _refuse_present(from_pan_rad, from_tilt_rad)
     target = np.asarray(target_in_rover_m, dtype=np.float64)
     pixel = np.asarray(camera_in_head.image_center_px if pixel_px is None else pixel_px, dtype=np.float64)
-    if target.ndim > 1 or pixel.ndim > 1:
-        return solve_many(  # type: ignore[return-value]  # a type checker cannot tell the shapes apart
-            mast, camera_in_head, target, pixel, from_pan_rad=from_pan_rad, from_tilt_rad=from_tilt_rad
-        )
     if pixel.shape != (2,) or not np.isfinite(pixel).all():
         raise Unreachable("bad_pixel", f"pixel {pixel.tolist()} is not two finite numbers")
-    rays = camera_in_head.ray(pixel)
-    if not rays.valid:
+    ray = camera_in_head.ray(pixel)
+    if not ray.valid:
         raise Unreachable(
             "bad_pixel",
             f"pixel ({pixel[0]:g}, {pixel[1]:g}) has no ray in this "
             f"{camera_in_head.kind} camera{camera_in_head.why_no_ray}",
         )
-    return _solve(mast, rays.origins_m, rays.directions, target, from_pan_rad, from_tilt_rad, explain=True)
-
-
-def solve_many(
-    mast: Mast,
-    camera_in_head: CameraModel,
-    targets_in_rover_m: ArrayLike,
-    pixels_px: ArrayLike | None = None,
-    *,
-    from_pan_rad: float = 0.0,
-    from_tilt_rad: float = 0.0,
-) -> Solutions:
-    """Return the joint angles of many targets (..., 3), each as ``solve`` gives them for that target alone.
-
-    A target that cannot be reached, or is no target, does not stop the others: ``refused`` has its code. The
-    wanted pixels (..., 2) are broadcast against the targets.
-
-    Raises
-    ------
-    Unreachable
-        ``bad_target``, ``bad_pixel``: arrays of another shape, or that do not go together.
-        ``parallel_axes``, ``bad_joints``: as ``solve``.
-    """
-    check_here(from_pan_rad, from_tilt_rad)
-    targets = np.asarray(targets_in_rover_m, dtype=np.float64)
-    pixels = np.asarray(camera_in_head.image_center_px if pixels_px is None else pixels_px, dtype=np.float64)
-    for array, width, code, name in (
-        (targets, 3, "bad_target", "targets"),
-        (pixels, 2, "bad_pixel", "pixels"),
-    ):
-        if array.ndim == 0 or array.shape[-1] != width:
-            raise Unreachable(code, f"{name} of shape {array.shape} where (..., {width}) is expected")
-    try:
-        shape = np.broadcast_shapes(targets.shape[:-1], pixels.shape[:-1])
-    except ValueError:
-        raise Unreachable(
-            "bad_target",
-            f"targets of shape {targets.shape} and pixels of shape {pixels.shape} do not go together",
-        ) from None
-    rays = camera_in_head.ray(np.broadcast_to(pixels, (*shape, 2)))
-    every_target = np.broadcast_to(targets, (*shape, 3))
-    found = np.full((3, *shape, _MOST), np.nan)
-    refused = np.full(shape, "", dtype="<U10")
-    for at in np.ndindex(shape):
-        try:
-            if not rays.valid[at]:
-                raise Unreachable("bad_pixel", "the pixel has no ray")
-            solutions = _solve(
-                mast, rays.origins_m[at], rays.directions[at], every_target[at],
-                from_pan_rad, from_tilt_rad, explain=False,
-            )  # fmt: skip
-        except Unreachable as refusal:
-            if refusal.code == "parallel_axes":  # the mast's fault, not the target's
-                raise
-            refused[at] = refusal.code
-            continue
-        for column, one in enumerate(solutions[:_MOST]):
-            found[(slice(None), *at, column)] = one.pan_rad, one.tilt_rad, one.range_m
-    for array in (found, refused):
-        array.setflags(write=False)
-    pan_rad, tilt_rad, range_m = found
-    return Solutions(pan_rad, tilt_rad, range_m, refused)
-
-
-def _solve(
-    mast: Mast,
-    origin_m: FloatArray,
-    direction: FloatArray,
-    target: FloatArray,
-    from_pan_rad: float,
-    from_tilt_rad: float,
-    explain: bool,
-) -> list[Solution]:
-    """Solve for one target; a refusal says by how much if it is to explain itself, which takes a search."""
     if target.shape != (3,):
         raise Unreachable(
             "bad_target", f"target of shape {target.shape} where three coordinates are expected"
@@ -181,7 +94,7 @@ def _solve(
         raise Unreachable("bad_target", f"target {target.tolist()} is not three finite numbers below 1e9 m")
     x, y, z = ((target - mast.translation_m) @ mast.rover_from_mast.rotation).tolist()
     k = mast.axis_twist_rad
-    arm = Arm(mast.axis_offset_m, math.sin(k), math.cos(k), _triple(origin_m), _triple(direction))
+    arm = Arm(mast.axis_offset_m, math.sin(k), math.cos(k), _triple(ray.origins_m), _triple(ray.directions))
     # The axes are parallel to a milliradian, and the mast is not a pan/tilt head.
     if abs(arm.cos_k) < 1e-3:
         raise Unreachable(
@@ -201,8 +114,111 @@ def _solve(
         if not any(_same(pan, other.pan_rad) and _same(tilt, other.tilt_rad) for other in found):
             found.append(Solution(pan, _wrapped(tilt), s))
     if not found:
-        raise arm.why_not(rho, z, explain)
-    return sorted(found, key=lambda one: order(one, from_pan_rad, from_tilt_rad))
+        raise arm.why_not(rho, z)
+    return sorted(found, key=lambda one: _order(one, from_pan_rad, from_tilt_rad))
+
+
+def choose(
+    solutions: Sequence[Solution],
+    pan_limits_rad: tuple[float, float],
+    tilt_limits_rad: tuple[float, float],
+    from_pan_rad: float = 0.0,
+    from_tilt_rad: float = 0.0,
+    read: Callable[[Solution], tuple[float, float]] | None = None,
+) -> Solution:
+    """Return the solution within the joint limits that comes first: the first of `ordered`."""
+    return ordered(solutions, pan_limits_rad, tilt_limits_rad, from_pan_rad, from_tilt_rad, read)[0]
+
+
+def ordered(
+    solutions: Sequence[Solution],
+    pan_limits_rad: tuple[float, float],
+    tilt_limits_rad: tuple[float, float],
+    from_pan_rad: float = 0.0,
+    from_tilt_rad: float = 0.0,
+    read: Callable[[Solution], tuple[float, float]] | None = None,
+) -> list[Solution]:
+    """Return the solutions within the joint limits: upright ones first, then by least motion.
+
+    A joint that turns past ±π (limits of 20 to 350 degrees, say) is offered each angle a whole turn up and
+    down too. ``read`` gives the head's readings at a solution's true angles: limits, both ends included,
+    motion and where the head is now are of these. By default joints read true.
+
+    Raises
+    ------
+    Unreachable
+        ``outside_limits``: with the angle, the limit and by how much, for the solution that misses least.
+        ``bad_joints``: a limit or an angle is not a number, a limit's lowest is above its highest, or there
+        is no solution to choose from.
+    """
+    _refuse_present(from_pan_rad, from_tilt_rad)
+    read = read or _true_angles
+    limits = (pan_limits_rad, tilt_limits_rad)
+    for joint, (low, high) in zip(("pan", "tilt"), limits, strict=True):
+        if not low <= high:  # not a number either
+            raise Unreachable(
+                "bad_joints",
+                f"the {joint} limits are [{low}, {high}] rad where two rising numbers are expected",
+            )
+    if not solutions:
+        raise Unreachable("bad_joints", "there is no solution to choose from")
+    for one in solutions:
+        if not (math.isfinite(one.pan_rad) and math.isfinite(one.tilt_rad)):
+            raise Unreachable(
+                "bad_joints", f"a solution has pan {one.pan_rad} and tilt {one.tilt_rad} rad: no angles"
+            )
+    turns = (0.0, math.tau, -math.tau)
+    turned = [
+        Solution(one.pan_rad + pan, one.tilt_rad + tilt, one.range_m)
+        for one in solutions
+        for pan in turns
+        for tilt in turns
+    ]
+
+    def beyond(one: Solution) -> list[float]:
+        """By how much each angle is outside its limits; 0 inside."""
+        return [
+            max(low - angle, angle - high, 0.0) for angle, (low, high) in zip(read(one), limits, strict=True)
+        ]
+
+    inside = [one for one in turned if not any(beyond(one))]
+    if inside:
+        return sorted(inside, key=lambda one: _order(one, from_pan_rad, from_tilt_rad, read))
+    nearest = min(turned, key=lambda one: max(beyond(one)))
+    each = zip(("pan", "tilt"), read(nearest), beyond(nearest), limits, strict=True)
+    raise Unreachable(
+        "outside_limits",
+        " and ".join(
+            f"{joint} {angle:.6g} rad is {excess:.3g} rad beyond the limit "
+            f"{low if angle < low else high:.6g} rad"
+            for joint, angle, excess, (low, high) in each
+            if excess > 0.0
+        ),
+    )
+
+
+def _refuse_present(from_pan_rad: float, from_tilt_rad: float) -> None:
+    """Refuse joint angles that are not finite."""
+    if not (math.isfinite(from_pan_rad) and math.isfinite(from_tilt_rad)):
+        raise Unreachable(
+            "bad_joints", f"the head is at pan {from_pan_rad}, tilt {from_tilt_rad} rad: no angles"
+        )
+
+
+def _true_angles(one: Solution) -> tuple[float, float]:
+    return one.pan_rad, one.tilt_rad
+
+
+def _order(
+    one: Solution,
+    from_pan_rad: float,
+    from_tilt_rad: float,
+    read: Callable[[Solution], tuple[float, float]] = _true_angles,
+) -> tuple[bool, float]:
+    """The key by which solutions are sorted; present angles are what ``read`` gives."""
+    upright = abs(math.remainder(one.tilt_rad, math.tau)) <= 0.5 * math.pi
+    pan_rad, tilt_rad = read(one)
+    return not upright, max(abs(pan_rad - from_pan_rad), abs(tilt_rad - from_tilt_rad))
 
 
 def _triple(vector: Sequence[float] | FloatArray) -> tuple[float, float, float]:

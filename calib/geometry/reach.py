@@ -100,7 +100,7 @@ class Arm:
                 if s > 0.0:
                     yield 0.5 * excess - t * (b + 0.5 * a * t), u_y0 + u_y1 * t, s
 
-    def why_not(self, rho: float, z: float, explain: bool) -> Unreachable:
+    def why_not(self, rho: float, z: float) -> Unreachable:
         """Return the refusal for a target that no pan and tilt bring onto the ray."""
         # The tilt axis turns about (a, 0, 0) of the arm frame; |w| is the target's distance from there.
         farthest = math.hypot(rho + abs(self.a), z)
@@ -111,8 +111,6 @@ class Arm:
                 f"target is at most {farthest:.6g} m from the tilt axis centre, {nearest - farthest:.3g} m "
                 f"nearer than this pixel's ray comes ({nearest:.6g} m)",
             )
-        if not explain:
-            return Unreachable("blind_cone", "target is too near the pan axis")
         edge = self._edge_m(rho, z)
         side = "up" if z < 0.0 else "down"
         angle = math.atan2(rho, abs(z))

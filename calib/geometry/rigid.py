@@ -55,6 +55,16 @@ class ReadOnlyArrays:
         self.__dict__.update(state)
 
 
+def unit_vector(vector: ArrayLike) -> FloatArray:
+    """Return a vector (3,) at length 1; ValueError if it has no direction."""
+    given = np.asarray(vector, dtype=np.float64)
+    length = float(np.linalg.norm(given))
+    if not 0.0 < length < math.inf:
+        raise ValueError(f"{given.tolist()} where a direction is expected")
+    # A length so close to 1 is 1: such vectors keep their bits when a file is read and written.
+    return given if abs(length - 1.0) <= 4e-16 else given / length
+
+
 def rot_x(angle_rad: float) -> FloatArray:
     """Return the (3, 3) right-handed rotation about x."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)

@@ -66,21 +66,17 @@ class Triangulation(ReadOnlyArrays):
 def triangulate(
     left: CameraModel, right: CameraModel, left_px: ArrayLike, right_px: ArrayLike, sigma_px: float = 0.2
 ) -> Triangulation:
-    """Return the point seen at one pixel in each of two cameras, which are in one common frame.
+    """Return the point seen at one pixel (2,) in each of two cameras, which are in one common frame.
 
-    Parameters
-    ----------
-    left_px, right_px
-        (2,) pixel (x, y) of the point in each image; or (..., 2) many of them, broadcast: then nothing is
-        raised for single points, as `triangulate_many`.
-    sigma_px
-        One-sigma noise of each pixel coordinate, independent in both axes and both images.
+    Many pixels (..., 2) are broadcast; a pair of them without a point stops no other, and ``refused`` has its
+    code. ``sigma_px`` is the noise of each pixel coordinate, independent in both axes and both images.
 
     Raises
     ------
     NoStereoPoint
-        ``bad_pixel``: a pixel is not two finite numbers or has no ray. ``parallel_rays``: the rays meet
-        under less than 1e-9 rad. ``behind_camera``: they meet behind a camera, that is they diverge ahead.
+        ``bad_pixel``: a pixel is not two finite numbers or has no ray; or arrays of another shape, or that do
+        not go together. ``parallel_rays``: the rays meet under less than 1e-9 rad. ``behind_camera``: they
+        meet behind a camera, that is they diverge ahead.
     ValueError
         If the sigma is negative or not finite.
 
@@ -96,49 +92,13 @@ def triangulate(
     >>> round(float(seen.position_m[0]), 6), round(float(seen.covariance_m2[0, 0]) ** 0.5, 6)
     (5.0, 0.353553)
     """
+    if finite_float("sigma_px", sigma_px) < 0.0:
+        raise ValueError(f"sigma_px is {sigma_px} where 0 or more is expected")
     pixels = [np.asarray(pixel, dtype=np.float64) for pixel in (left_px, right_px)]
-    if max(xy.ndim for xy in pixels) > 1:
-        return triangulate_many(left, right, pixels[0], pixels[1], sigma_px)
+    single = max(xy.ndim for xy in pixels) == 1
     for side, xy in zip(SIDES, pixels, strict=True):
-        if xy.shape != (2,) or not np.isfinite(xy).all():
+        if single and (xy.shape != (2,) or not np.isfinite(xy).all()):
             raise NoStereoPoint("bad_pixel", f"{side} pixel {xy.tolist()} is not two finite numbers")
-    seen, found = _triangulated(left, right, pixels[0], pixels[1], sigma_px)
-    for side, model, xy, has_ray in zip(SIDES, (left, right), pixels, seen.has_ray, strict=True):
-        if not has_ray[0]:
-            raise NoStereoPoint(
-                "bad_pixel",
-                f"{side} pixel {xy.tolist()} has no ray in this {model.kind} camera{model.why_no_ray}",
-            )
-    if found.refused == "parallel_rays":
-        raise NoStereoPoint(
-            "parallel_rays", f"the two rays are parallel to {seen.sines[0]:.2g} rad: no point where they meet"
-        )
-    if found.refused:
-        s1, s2 = seen.ranges_m[0]
-        raise NoStereoPoint(
-            "behind_camera",
-            f"the two rays diverge: they come nearest {s1:.4g} m along the left "
-            f"and {s2:.4g} m along the right one, and both must be ahead",
-        )
-    return found
-
-
-def triangulate_many(
-    left: CameraModel, right: CameraModel, left_px: ArrayLike, right_px: ArrayLike, sigma_px: float = 0.2
-) -> Triangulation:
-    """Return the points seen at many pixels of two cameras, each as ``triangulate`` gives it alone.
-
-    A pair of pixels without a point does not stop the others: ``refused`` has its code.
-
-    Raises
-    ------
-    NoStereoPoint
-        ``bad_pixel``: arrays of another shape, or that do not go together.
-    ValueError
-        If the sigma is negative or not finite.
-    """
-    pixels = [np.asarray(pixel, dtype=np.float64) for pixel in (left_px, right_px)]
-    for side, xy in zip(SIDES, pixels, strict=True):
         if xy.ndim == 0 or xy.shape[-1] != 2:
             raise NoStereoPoint("bad_pixel", f"{side} pixels of shape {xy.shape} where (..., 2) is expected")
     try:
@@ -149,7 +109,26 @@ def triangulate_many(
             f"left pixels of shape {pixels[0].shape} and right pixels of shape {pixels[1].shape} "
             "do not go together",
         ) from None
-    return _triangulated(left, right, both[0], both[1], sigma_px)[1]
+    seen = _meeting(left, right, *(xy.reshape(-1, 2) for xy in both))
+    refused = np.select(
+        [~seen.has_ray.all(axis=0), seen.sines < PARALLEL_RAD, ~(seen.ranges_m > 0.0).all(axis=1)],
+        ["bad_pixel", "parallel_rays", "behind_camera"],
+        "",
+    )
+    if single and refused[0]:
+        raise _refusal(str(refused[0]), seen, (left, right), pixels)
+    rates = seen.rates_m_per_px
+    covariance = sigma_px * sigma_px * (rates @ rates.transpose(0, 2, 1))
+    arrays: list[Any] = [
+        np.where((refused == "").reshape(-1, *[1] * (one.ndim - 1)), one, np.nan)
+        for one in (seen.positions_m, covariance, np.sqrt(_dot(seen.gaps_m, seen.gaps_m)), seen.ranges_m)
+    ]
+    arrays += [rates, seen.gap_m_per_px, refused]
+    arrays = [one.reshape((*both[0].shape[:-1], *one.shape[1:]))[()] for one in arrays]
+    for one in arrays:
+        if isinstance(one, np.ndarray):
+            one.setflags(write=False)
+    return Triangulation(*arrays)
 
 
 class _Meeting(NamedTuple):
@@ -168,30 +147,23 @@ class _Meeting(NamedTuple):
     gap_m_per_px: FloatArray
 
 
-def _triangulated(
-    left: CameraModel, right: CameraModel, left_px: FloatArray, right_px: FloatArray, sigma_px: float
-) -> tuple[_Meeting, Triangulation]:
-    """Where the rays of pixels (..., 2) come nearest, and the points that follow."""
-    if finite_float("sigma_px", sigma_px) < 0.0:
-        raise ValueError(f"sigma_px is {sigma_px} where 0 or more is expected")
-    seen = _meeting(left, right, left_px.reshape(-1, 2), right_px.reshape(-1, 2))
-    refused = np.select(
-        [~seen.has_ray.all(axis=0), seen.sines < PARALLEL_RAD, ~(seen.ranges_m > 0.0).all(axis=1)],
-        ["bad_pixel", "parallel_rays", "behind_camera"],
-        "",
+def _refusal(
+    code: str, seen: _Meeting, models: tuple[CameraModel, CameraModel], pixels: list[FloatArray]
+) -> NoStereoPoint:
+    """Why two single pixels show no point, in numbers."""
+    if code == "bad_pixel":
+        k = int(seen.has_ray[0, 0])  # the left one's fault if it has no ray
+        camera = f"{models[k].kind} camera{models[k].why_no_ray}"
+        return NoStereoPoint(code, f"{SIDES[k]} pixel {pixels[k].tolist()} has no ray in this {camera}")
+    if code == "parallel_rays":
+        text = f"the two rays are parallel to {seen.sines[0]:.2g} rad: no point where they meet"
+        return NoStereoPoint(code, text)
+    s1, s2 = seen.ranges_m[0]
+    return NoStereoPoint(
+        code,
+        f"the two rays diverge: they come nearest {s1:.4g} m along the left and {s2:.4g} m along the right "
+        "one, and both must be ahead",
     )
-    rates = seen.rates_m_per_px
-    covariance = sigma_px * sigma_px * (rates @ rates.transpose(0, 2, 1))
-    arrays: list[Any] = [
-        np.where((refused == "").reshape(-1, *[1] * (one.ndim - 1)), one, np.nan)
-        for one in (seen.positions_m, covariance, np.sqrt(_dot(seen.gaps_m, seen.gaps_m)), seen.ranges_m)
-    ]
-    arrays += [rates, seen.gap_m_per_px, refused]
-    arrays = [one.reshape((*left_px.shape[:-1], *one.shape[1:]))[()] for one in arrays]
-    for one in arrays:
-        if isinstance(one, np.ndarray):
-            one.setflags(write=False)
-    return seen, Triangulation(*arrays)
 
 
 def _meeting(left: CameraModel, right: CameraModel, left_px: FloatArray, right_px: FloatArray) -> _Meeting:

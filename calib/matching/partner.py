@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from calib.errors import NoStereoPoint
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray, finite_float
-from calib.geometry.stereo import triangulate, triangulate_many
+from calib.geometry.stereo import triangulate
 from calib.matching.patch import match_patch
 from calib.matching.relief import surface_seen
 from calib.matching.sweep import Swept, sweep
@@ -149,7 +149,7 @@ def normal_seen(
         return plane.normal
     mine = own.pixel_px + deformed(mine - own.predicted_px, own)
     theirs = found.pixel_px + deformed(offsets, found)
-    left, right, top, bottom = triangulate_many(camera, partner, mine, theirs).position_m
+    left, right, top, bottom = triangulate(camera, partner, mine, theirs).position_m
     normal = np.cross(right - left, bottom - top)
     sight, length = target_m - camera.C, float(np.linalg.norm(normal))
     # Written so that a neighbour without a point in both cameras falls back too.

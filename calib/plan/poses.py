@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from calib.adjust.solver import covariance_of
 from calib.errors import CalibError, Unreachable
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.pointing import solve
+from calib.geometry.pointing import Solution, choose, solve
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
-from calib.geometry.solutions import Solution, choose
 from calib.plan.knowledge import BenchShot, BoardView, ExpectedPointing, Knowledge
 
 PLACES = (-0.05, 0.12, 0.31, 0.5, 0.69, 0.88, 1.05)
@@ -277,7 +276,7 @@ def rover_from_board(
     """
     mounted = rig.cameras[camera]
     model = mounted.model
-    axes = model.axes
+    axes = model.rotation.T
     rays = model.ray(pixels_px).directions @ axes
     if len(rays) < FEWEST:
         raise CalibError(f"{len(rays)} corners where {FEWEST} at least fix a board")

@@ -19,10 +19,9 @@ from calib.errors import CalibError, Unreachable
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.covariance import RigCovariance
 from calib.geometry.handoff import Joints
-from calib.geometry.pointing import solve
+from calib.geometry.pointing import Solution, choose, solve
 from calib.geometry.rig import Mast, Rig
 from calib.geometry.rigid import Rigid
-from calib.geometry.solutions import Solution, choose
 from calib.geometry.stereo import triangulate
 from calib.matching.partner import find_partner
 from calib.matching.patch import match_patch

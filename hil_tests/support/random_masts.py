@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import Unreachable
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.pointing import solve
+from calib.geometry.pointing import Solution, solve
 from calib.geometry.rig import Mast
-from calib.geometry.solutions import Solution
 
 SAME_RAD = 1e-5
 """A solution is the generating one within this; two that meet at the edge of reach are good to 1e-6."""

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.errors import CalibError, Unreachable
-from calib.geometry.pointing import solve
+from calib.geometry.pointing import choose, solve
 from calib.geometry.rigid import FloatArray
-from calib.geometry.solutions import choose
 from calib.geometry.stereo import triangulate
 from calib.plan.knowledge import BenchShot
 from calib.plan.poses import candidates

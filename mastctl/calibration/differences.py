@@ -78,7 +78,7 @@ def implied_motion(pairs: Sequence[tuple[CameraModel, CameraModel]]) -> tuple[Ri
     models; all of the new ones in one frame, all of the former in another.
     """
     new, former = pairs[0]
-    turn = new.axes @ former.axes.T
+    turn = new.rotation.T @ former.rotation
     start = Rigid(turn, new.C - turn @ former.C)
     seen = [(one, *_what_it_saw(old, RANGES_M)) for one, old in pairs]
 

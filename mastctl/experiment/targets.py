@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from calib.errors import NoStereoPoint, Unreachable
 from calib.geometry import pointing
 from calib.geometry.cahvor import CameraModel
+from calib.geometry.pointing import Solution, choose
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
-from calib.geometry.solutions import Solution, choose
 from calib.geometry.stereo import triangulate
 from calib.matching.partner import find_partner
 from calib.matching.warp import PosedImage, grey

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import Protocol
 
-from calib.geometry.solutions import Solution, ordered
+from calib.geometry.pointing import Solution, ordered
 from drivers.clock import Clock
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading, RestWatch

@@ -29,9 +29,8 @@ from typing import Any, cast
 import numpy as np
 
 from calib.errors import CalibError
-from calib.geometry.pointing import solve
+from calib.geometry.pointing import Solution, solve
 from calib.geometry.rigid import FloatArray
-from calib.geometry.solutions import Solution
 from calib.geometry.stereo import Triangulation, triangulate
 from calib.matching.partner import StereoMatch
 from calib.matching.verdict import PatchMatch

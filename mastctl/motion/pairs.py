@@ -13,10 +13,9 @@ from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.handoff import Joints, hand_off
-from calib.geometry.pointing import solve
+from calib.geometry.pointing import Solution, choose, solve
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
-from calib.geometry.solutions import Solution, choose
 from calib.geometry.stereo import stereo_range_error_m
 from calib.matching.handed_over import MatchedHandoff, matched_handoff
 from calib.matching.handoff import RefineSettings, refine_handoff

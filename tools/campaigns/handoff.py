@@ -28,8 +28,8 @@ from calib.files.mast_file import load_rig
 from calib.geometry import pointing
 from calib.geometry.covariance import RigCovariance, moved_rig, stored_covariance
 from calib.geometry.handoff import Joints, PredictedPixel, hand_off
+from calib.geometry.pointing import choose
 from calib.geometry.rig import Rig
-from calib.geometry.solutions import choose
 from calib.matching.handoff import RefinedPixel, RefineSettings, refine_handoff
 from calib.matching.partner import find_partner
 from calib.matching.verdict import MatchSettings

@@ -24,10 +24,9 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import NoStereoPoint
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.pointing import solve
+from calib.geometry.pointing import Solution, solve
 from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import FloatArray, Rigid
-from calib.geometry.solutions import Solution
 from calib.geometry.stereo import triangulate
 from calib.matching.partner import find_partner
 from calib.matching.patch import match_patch

@@ -14,6 +14,7 @@ import numpy as np
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Mast
+from calib.geometry.rigid import unit_vector
 from tools.command import rms
 from tools.flight.difference import model_difference, with_one_lens
 from tools.flight.poses import PoseFit, fit_poses
@@ -73,8 +74,9 @@ def _label(row: dict[str, str], angles: str) -> Label:
         return np.array([float(row[f"{letter}_{name}"]) for name in names])
 
     size_px = (int(row["line_samples"]), int(row["lines"]))
-    vectors: dict[str, Any] = {letter: vector(letter) for letter in "CAHVO"}
-    model, _ = CameraModel.normalised(kind="CAHVOR", size_px=size_px, R=vector("R", "012"), **vectors)
+    vectors: dict[str, Any] = {letter: vector(letter) for letter in "CHV"}
+    vectors |= {letter: unit_vector(vector(letter)) for letter in "AO"}
+    model = CameraModel("CAHVOR", size_px, R=vector("R", "012"), **vectors)
     return Label(row["product_id"], model, float(row[f"az_{angles}_rad"]), float(row[f"el_{angles}_rad"]))
 
 
@@ -130,7 +132,8 @@ def printed_labels(fitted: PoseFit, labels: Sequence[Label], seed: int) -> list[
         six: dict[str, Any] = {
             letter: np.array([float(f"{x:.6g}") for x in getattr(true, letter)]) for letter in "CAHVO"
         }
-        model, _ = CameraModel.normalised(kind=true.kind, size_px=true.size_px, R=true.R, **six)
+        six |= {letter: unit_vector(six[letter]) for letter in "AO"}
+        model = CameraModel(true.kind, true.size_px, R=true.R, **six)
         made.append(replace(label, model=model))
     return made
 

@@ -245,7 +245,7 @@ def _start(
     hand-eye problem). Positions are then linear in t, a and the camera's place in the head.
     """
     eye = np.eye(3)
-    rotations = [model.axes for model in models]
+    rotations = [model.rotation.T for model in models]
     best_value, best_vector, twist = np.inf, np.zeros(18), 0.0
     for trial in twists_rad:
         gimbals = [rot_z(p) @ rot_x(trial) @ rot_y(t) for p, t in zip(pan_rad, tilt_rad, strict=True)]

@@ -24,10 +24,9 @@ from scipy.spatial.transform import Rotation
 from calib.errors import Unreachable
 from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.pointing import solve
+from calib.geometry.pointing import choose, solve
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid
-from calib.geometry.solutions import choose
 from calib.geometry.stereo import triangulate
 from calib.survey.reader import read_survey
 from calib.survey.records import Sigma

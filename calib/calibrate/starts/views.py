@@ -134,10 +134,8 @@ def centred_camera(
     """Return a camera without distortion at the origin, its axis along z (``cahvore_type`` 2: a fish-eye)."""
     x, y, z = np.eye(3)
     cx, cy = (np.array(size_px) - 1) / 2
-    return CameraModel.normalised(
-        kind, size_px, np.zeros(3), z, focal_px * x + cx * z, focal_px * y + cy * z, z,
-        cahvore_type=cahvore_type,
-    )[0]  # fmt: skip
+    h, v = focal_px * x + cx * z, focal_px * y + cy * z
+    return CameraModel(kind, size_px, np.zeros(3), z, h, v, cahvore_type=cahvore_type)
 
 
 def poses_of(model: CameraModel, term: ImageTerm) -> list[tuple[float, Rigid]]:

@@ -18,9 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import Unreachable
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.pointing import solve
+from calib.geometry.pointing import Solution, choose, solve
 from calib.geometry.rig import Mast
-from calib.geometry.solutions import Solution, choose
 from hil_tests.support import random_masts
 
 WORST_PX = 1e-7

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import pytest
 
-from calib.geometry.solutions import Solution
+from calib.geometry.pointing import Solution
 from drivers.clock import ManualClock
 from drivers.interfaces import Reading
 from mastctl.devices.joint_history import HeadReading
