@@ -8,7 +8,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -74,9 +73,8 @@ def _label(row: dict[str, str], angles: str) -> Label:
         return np.array([float(row[f"{letter}_{name}"]) for name in names])
 
     size_px = (int(row["line_samples"]), int(row["lines"]))
-    vectors: dict[str, Any] = {letter: vector(letter) for letter in "CHV"}
-    vectors |= {letter: unit_vector(vector(letter)) for letter in "AO"}
-    model = CameraModel("CAHVOR", size_px, R=vector("R", "012"), **vectors)
+    c, a, h, v, o = (vector(letter) for letter in "CAHVO")
+    model = CameraModel("CAHVOR", size_px, c, unit_vector(a), h, v, unit_vector(o), vector("R", "012"))
     return Label(row["product_id"], model, float(row[f"az_{angles}_rad"]), float(row[f"el_{angles}_rad"]))
 
 
@@ -129,11 +127,8 @@ def printed_labels(fitted: PoseFit, labels: Sequence[Label], seed: int) -> list[
         true = fitted.camera_in_rover(pan, tilt)
         if label.model.size_px != true.size_px:
             true = _resized(true, label.model.size_px)
-        six: dict[str, Any] = {
-            letter: np.array([float(f"{x:.6g}") for x in getattr(true, letter)]) for letter in "CAHVO"
-        }
-        six |= {letter: unit_vector(six[letter]) for letter in "AO"}
-        model = CameraModel(true.kind, true.size_px, R=true.R, **six)
+        c, a, h, v, o = (np.array([float(f"{x:.6g}") for x in getattr(true, letter)]) for letter in "CAHVO")
+        model = CameraModel(true.kind, true.size_px, c, unit_vector(a), h, v, unit_vector(o), true.R)
         made.append(replace(label, model=model))
     return made
 
