@@ -1,4 +1,7 @@
-"""What simulated heads are made of: presets, the keys of ``simulation.head``, a true rig's own errors."""
+"""What simulated heads are made of: presets, the keys of ``simulation.head``, a true rig's own errors.
+
+Behind ``simulation.wire`` stands a byte simulator; `WIRED_HEADS` says of which model.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +22,7 @@ SLOWEST_DECAY_PER_S = 0.3
 
 MOST_HARMONICS, HARMONIC_RAD = 4, 0.05
 PRESET_NAMES = ("ptu_d46_70", "dynamixel_x", "ph42")
-
-
 ARCSEC = math.radians(1 / 3600)
-
-
 _SAG_RAD = 5e-5  # the issue's 0.05 mrad, which the mast file does not know
 
 # FLIR PTU-D46-70 in eighth steps of 11.57 arcsec, a quarter of its 46.29 arcsec half step (derived from the
@@ -96,7 +95,7 @@ class HeadOptions(DriverOptions):
 
 
 def check_together(axis: AxisSettings) -> None:
-    """Pass an axis whose values go together. Raises BadOptions."""
+    """Raise BadOptions for an axis whose values do not go together."""
     if 0 < axis.approach_rad <= axis.backlash_rad:
         raise BadOptions(
             f"simulation.head.approach_rad {axis.approach_rad:g} rad does not take up the backlash "
@@ -143,6 +142,40 @@ PRESETS: Mapping[str, HeadModel] = {
         "ph42", _PH42, replace(_PH42, low_rad=-math.pi / 2, high_rad=math.pi / 2, sag_rad=_SAG_RAD)
     ),
 }
+
+
+@dataclass(frozen=True)
+class WireModel:
+    """What stands behind a preset's wire: the simulator's model, and the driver's name for it."""
+
+    wire: str
+    simulated: str
+    driver_model: str = ""
+
+
+WIRED_HEADS: Mapping[str, WireModel] = {
+    "dynamixel_x": WireModel("dynamixel", "xm430_w350", "XM430-W350"),
+    "ph42": WireModel("dynamixel", "ph42_020_s300", "PH42-020-S300"),
+    "ptu_d46_70": WireModel("flir_ptu", "d46_70"),
+}
+
+DEFAULT_HEADS: Mapping[str, str] = {"dynamixel": "dynamixel_x", "flir_ptu": "ptu_d46_70"}
+"""The wires there are, and the head behind each where a configuration names none."""
+
+
+def check_head(wire: str, head: HeadModel) -> None:
+    """Raise BadOptions, naming those that can, for a head that cannot stand behind a wire."""
+    fitting = [name for name, one in WIRED_HEADS.items() if one.wire == wire]
+    if head.name not in fitting:
+        raise BadOptions(
+            f"simulation.head is {head.name!r}, which is not behind simulation.wire {wire!r}; "
+            f"expected {' or '.join(fitting)}"
+        )
+    preset = PRESETS[head.name]
+    if head.pan.count_rad != preset.pan.count_rad or head.tilt.count_rad != preset.tilt.count_rad:
+        raise BadOptions(
+            f"simulation.head.count_rad cannot be changed behind simulation.wire {wire!r}: the device has it"
+        )
 
 
 def head_settings(value: Any) -> HeadModel:

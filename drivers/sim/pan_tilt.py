@@ -9,8 +9,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any, TypeVar
 
 from drivers.clock import Clock
@@ -18,14 +16,13 @@ from drivers.errors import BadOptions, BadReply, DriverError, NoReply
 from drivers.faults import PAN_TILT, Fault, FaultPanel
 from drivers.interfaces import AxisMotion, HeadInfo, PanTilt, Reading
 from drivers.serial_line import OpenLine
-from drivers.sim.axis import AxisSettings
-from drivers.sim.heads import PRESETS, HeadModel
-from drivers.sim.wire.axis import WireAxis
+from drivers.sim.axis import AxisSettings, WireAxis
+from drivers.sim.heads import WIRED_HEADS, HeadModel, WireModel, check_head
 from drivers.sim.wire.carrier import WireDevice
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
-from drivers.sim.wire.dynamixel_registers import BAUD_RATES
+from drivers.sim.wire.dynamixel_models import BAUD_RATES
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
-from drivers.sim.wire.memory_line import MemoryLine
+from drivers.sim.wire.line import MemoryLine
 from drivers.sim.wire.ptu import SimulatedPtu
 
 _T = TypeVar("_T")
@@ -46,42 +43,6 @@ _WATCHDOG_S, _BRAKING_S = 0.38, 0.095
 """On the machine's clock renderer, simulator and driver share one process, which on a busy machine is silent
 for 0.3 s now and then. So the servos wait longer than usual, and brake harder, since they must stand 0.5 s
 after the last packet."""
-
-
-@dataclass(frozen=True)
-class _Wire:
-    """What stands behind a head of a name: which simulator's model, and the driver's name for it."""
-
-    wire: str
-    simulated: str
-    driver_model: str = ""
-
-
-_HEADS: Mapping[str, _Wire] = MappingProxyType(
-    {
-        "dynamixel_x": _Wire("dynamixel", "xm430_w350", "XM430-W350"),
-        "ph42": _Wire("dynamixel", "ph42_020_s300", "PH42-020-S300"),
-        "ptu_d46_70": _Wire("flir_ptu", "d46_70"),
-    }
-)
-
-DEFAULT_HEADS: Mapping[str, str] = MappingProxyType({"dynamixel": "dynamixel_x", "flir_ptu": "ptu_d46_70"})
-"""The wires there are, and the head behind each where a configuration names none."""
-
-
-def check_head(wire: str, head: HeadModel) -> None:
-    """Pass a head that can stand behind a wire. Raises BadOptions, naming those that can."""
-    fitting = [name for name, one in _HEADS.items() if one.wire == wire]
-    if head.name not in fitting:
-        raise BadOptions(
-            f"simulation.head is {head.name!r}, which is not behind simulation.wire {wire!r}; "
-            f"expected {' or '.join(fitting)}"
-        )
-    preset = PRESETS[head.name]
-    if head.pan.count_rad != preset.pan.count_rad or head.tilt.count_rad != preset.tilt.count_rad:
-        raise BadOptions(
-            f"simulation.head.count_rad cannot be changed behind simulation.wire {wire!r}: the device has it"
-        )
 
 
 class SimulatedPanTilt(PanTilt):
@@ -259,7 +220,7 @@ class WiredHead:
             WireAxis(head.tilt, faults, number=1, time_s=now_s),
         )
         make = _dynamixel if wire == "dynamixel" else _flir_ptu
-        device, open_head, options = make(_HEADS[head.name], head, self._axes, now_s)
+        device, open_head, options = make(WIRED_HEADS[head.name], head, self._axes, now_s)
         if head.pan.settle_s > 0:
             options["settle_s"] = head.pan.settle_s
         self.line = MemoryLine(device, clock, faults)
@@ -283,7 +244,7 @@ class WiredHead:
 _Made = tuple[WireDevice, Callable[[Mapping[str, Any], Clock, OpenLine], PanTilt], dict[str, Any]]
 
 
-def _dynamixel(kind: _Wire, head: HeadModel, axes: tuple[WireAxis, WireAxis], time_s: float) -> _Made:
+def _dynamixel(kind: WireModel, head: HeadModel, axes: tuple[WireAxis, WireAxis], time_s: float) -> _Made:
     """Two servos at 1 Mbaud, ids 1 and 2."""
     from drivers.dynamixel.head import open_head
 
@@ -313,7 +274,7 @@ def _dynamixel(kind: _Wire, head: HeadModel, axes: tuple[WireAxis, WireAxis], ti
     return DynamixelBus(servos), open_head, options
 
 
-def _flir_ptu(kind: _Wire, head: HeadModel, axes: tuple[WireAxis, WireAxis], time_s: float) -> _Made:
+def _flir_ptu(kind: WireModel, head: HeadModel, axes: tuple[WireAxis, WireAxis], time_s: float) -> _Made:
     """A unit in eighth steps, which counts pan to the left."""
     from drivers.flir_ptu.head import open_head
 

@@ -14,8 +14,7 @@ from drivers.errors import BadOptions
 from drivers.faults import read_script
 from drivers.options import DriverOptions, ReadBy, read_options, wholes
 from drivers.sim.camera_settings import CameraSettings, ClockSettings, TemperatureSettings
-from drivers.sim.heads import HeadModel, head_settings
-from drivers.sim.pan_tilt import DEFAULT_HEADS, check_head
+from drivers.sim.heads import DEFAULT_HEADS, HeadModel, check_head, head_settings
 from drivers.sim.scene import SceneSettings
 from drivers.simulation_clock import simulation_speed
 

@@ -13,10 +13,9 @@ from drivers.dynamixel.link import Link
 from drivers.faults import FaultPanel
 from drivers.flir_ptu import workshop as ptu_workshop
 from drivers.flir_ptu.head import open_head as open_ptu
-from drivers.sim.axis import AxisSettings
-from drivers.sim.wire.axis import WireAxis
+from drivers.sim.axis import AxisSettings, WireAxis
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
-from drivers.sim.wire.memory_line import MemoryLine
+from drivers.sim.wire.line import MemoryLine
 from drivers.sim.wire.ptu import SimulatedPtu
 from hil_tests.drivers.dynamixel.dynamixel_rig import X, rig
 from hil_tests.drivers.turned import turned

@@ -27,17 +27,15 @@ from drivers.flir_ptu.head import open_head as open_flir_ptu
 from drivers.interfaces import PanTilt
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.settings import LONGEST_REPLY_S
-from drivers.sim.axis import AxisSettings
+from drivers.sim.axis import AxisSettings, WireAxis
 from drivers.sim.heads import HeadModel
 from drivers.sim.pan_tilt import SimulatedPanTilt
-from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.carrier import WireDevice
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
 from drivers.sim.wire.feetech_bus import FeetechBus
 from drivers.sim.wire.feetech_servo import SimulatedFeetechServo
-from drivers.sim.wire.line import PtyLine, TcpLine
-from drivers.sim.wire.memory_line import MemoryLine
+from drivers.sim.wire.line import MemoryLine, PtyLine, TcpLine
 from drivers.sim.wire.ptu import SimulatedPtu
 from drivers.simulation_clock import SimulationClock
 

@@ -225,8 +225,7 @@ def _new_simulated(args: argparse.Namespace) -> Answer:
     import numpy as np
 
     from drivers.hardware import DeviceSettings, HardwareSettings, clock_for
-    from drivers.sim.heads import head_settings
-    from drivers.sim.pan_tilt import DEFAULT_HEADS, check_head
+    from drivers.sim.heads import DEFAULT_HEADS, check_head, head_settings
     from mastctl.packaged import driver_of_hardware
     from mastctl.setup.new_rig import built_rig
     from mastctl.setup.rig_folder import boards_about, check_empty, write_built, write_twin

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from drivers.clock import Clock
     from drivers.faults import FaultPanel
     from drivers.sim.axis import AxisSettings
-    from drivers.sim.wire.line import PtyLine, TcpLine, WireDevice
+    from drivers.sim.wire.carrier import WireDevice
+    from drivers.sim.wire.line import PtyLine, TcpLine
 
 GROUPS["rig sim"] = "simulated servos behind a serial line or a TCP port; a new simulated rover"
 
@@ -52,9 +53,9 @@ _PAN_TILT: tuple[Literal[0], Literal[1]] = (0, 1)
     example="--servo xl330_m288:1 --servo xl330_m288:2 --pty",
 )
 def _dynamixel(args: argparse.Namespace) -> int:
-    from drivers.sim.wire.axis import WireAxis
+    from drivers.sim.axis import WireAxis
     from drivers.sim.wire.dynamixel_bus import DynamixelBus
-    from drivers.sim.wire.dynamixel_registers import BAUD_RATES
+    from drivers.sim.wire.dynamixel_models import BAUD_RATES
     from drivers.sim.wire.dynamixel_servo import SimulatedServo
 
     if args.baud not in BAUD_RATES:
@@ -89,10 +90,9 @@ def _dynamixel(args: argparse.Namespace) -> int:
 )
 def _feetech(args: argparse.Namespace) -> int:
     from drivers.errors import BadOptions
-    from drivers.sim.wire.axis import WireAxis
+    from drivers.sim.axis import WireAxis
     from drivers.sim.wire.feetech_bus import FeetechBus
-    from drivers.sim.wire.feetech_memory import BAUDS
-    from drivers.sim.wire.feetech_servo import SimulatedFeetechServo
+    from drivers.sim.wire.feetech_servo import BAUDS, SimulatedFeetechServo
 
     if args.baud not in BAUDS:
         raise WrongUse(f"--baud is {args.baud}, expected one of {', '.join(str(b) for b in BAUDS)}")
@@ -123,7 +123,7 @@ def _feetech(args: argparse.Namespace) -> int:
 )
 def _ptu(args: argparse.Namespace) -> int:
     from drivers.errors import BadOptions
-    from drivers.sim.wire.axis import WireAxis
+    from drivers.sim.axis import WireAxis
     from drivers.sim.wire.ptu import SimulatedPtu
 
     panel, clock = _panel()

@@ -22,7 +22,7 @@ from drivers.faults import PAN_TILT
 from drivers.probes import ProbedCamera, ProbedHead
 from drivers.registry import driver_of
 from drivers.servo_bus.bench import USUAL_BAUD, ServosOnLine, line_words
-from drivers.sim.pan_tilt import DEFAULT_HEADS
+from drivers.sim.heads import DEFAULT_HEADS
 from mastctl.config import check_cameras, load_config
 from mastctl.packaged import SCHEMAS, config_folder, name_schema
 from mastctl.setup.drawing import (

@@ -15,8 +15,7 @@ from calib.files.mast_file import load_rig, save_rig
 from calib.files.yaml_text import dump_mapping
 from calib.geometry.rig import Rig
 from drivers.sim.axis import AxisSettings
-from drivers.sim.heads import PRESETS
-from drivers.sim.pan_tilt import DEFAULT_HEADS
+from drivers.sim.heads import DEFAULT_HEADS, PRESETS
 from mastctl.calibration.mast_file import rounded_matrix
 from mastctl.config import CONFIG_SCHEMA, check_cameras, load_config
 from mastctl.errors import MastctlError

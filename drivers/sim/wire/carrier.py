@@ -38,14 +38,9 @@ _L = TypeVar("_L", bound="Line")
 class Reply:
     """Bytes that a simulated device sends, a whole packet or line of text.
 
-    Attributes
-    ----------
-    delay_s
-        From the end of what it answers: of the received packet, or of the reply before it in the sequence.
-    sender
-        The servo's id; 0 for a pan/tilt unit; below 0 for an adapter's echo, which no fault falls on.
-    late_s
-        By how much the host gets it late, by a fault; the line is free meanwhile.
+    ``delay_s`` counts from the end of what it answers: of the received packet, or of the reply before it.
+    ``sender`` is the servo's id; 0 for a pan/tilt unit; below 0 for an adapter's echo, which has no faults.
+    By ``late_s`` a fault brings it late to the host; the line is free meanwhile.
     """
 
     data: bytes
@@ -148,6 +143,7 @@ class Line(ABC):
         device: WireDevice,
         clock: Clock,
         faults: FaultPanel | None,
+        *,
         wire_time: bool,
         observer: Observer | None,
     ) -> None:

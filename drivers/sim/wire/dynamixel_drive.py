@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import math
 
+from drivers.sim.axis import WireAxis
 from drivers.sim.motion import Motion
-from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_models import SimulatedModel
 from drivers.sim.wire.dynamixel_table import MODES, POSITION_MODE, ControlTable
 
@@ -102,7 +102,7 @@ class Drive:
 
     def torque_off(self, time_s: float) -> None:
         """Let the axis go."""
-        self.axis.limp(time_s)
+        self.axis.halt(time_s)
         self.rest(time_s)
 
     def stop(self, time_s: float) -> None:

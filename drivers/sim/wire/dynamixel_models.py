@@ -1,6 +1,9 @@
-"""The models of Dynamixel servo that can be simulated: tables, counts, units, modes.
+"""The models of Dynamixel servo that can be simulated: control tables, counts, units, modes.
 
-Source: ROBOTIS e-Manual, the page of each model. Where pages differ between editions the newest was taken.
+Written down from the maker's manual and on purpose not the driver's: a wrong number in one of the two makes a
+test fail. Source: ROBOTIS e-Manual (github.com/ROBOTIS-GIT/emanual), the page of each model; where pages
+differ between editions the newest was taken. Addresses and sizes agree with the ``.model`` tables of
+dynamixel-sdk (checked in hil_tests).
 """
 
 from __future__ import annotations
@@ -13,15 +16,27 @@ from typing import Any
 
 from drivers.errors import BadOptions
 from drivers.faults import nearest
-from drivers.sim.wire.dynamixel_registers import (
-    MX_MORE,
-    P_EEPROM,
-    P_RAM,
-    X_EEPROM,
-    X_RAM,
-    TableRegister,
-    rows,
-)
+
+
+@dataclass(frozen=True)
+class TableRegister:
+    """One item of a control table; ``low`` below zero makes it signed."""
+
+    address: int
+    size: int
+    name: str
+    writable: bool
+    initial: int
+    low: int
+    high: int
+
+    def to_bytes(self, value: int) -> bytes:
+        """Return the bytes on the wire, little end first, as many as the register has."""
+        return (value & ((1 << 8 * self.size) - 1)).to_bytes(self.size, "little")
+
+    def from_bytes(self, data: bytes) -> int:
+        """Return the value that bytes of the wire stand for."""
+        return int.from_bytes(data, "little", signed=self.low < 0)
 
 
 @dataclass(frozen=True)
@@ -65,13 +80,102 @@ class SimulatedModel:
         return {r.address + i: (r, i) for r in self.registers for i in range(r.size)}
 
 
-_RPM = math.tau / 60
+# A row is ``address size name access initial low high``. ``w`` is readable and writable, ``r`` read only.
+# ``initial`` is ``-`` where the servo computes the value or the manual gives none (then 0). Gains, external
+# ports and what a backup needs are left out.
+_EEPROM = """
+  0 2 model_number             r -
+  2 4 model_information        r -
+  6 1 firmware_version         r -
+  7 1 id                       w 1     0 252
+  8 1 baud_rate                w 1     0 7
+  9 1 return_delay_time        w 250   0 254
+ 10 1 drive_mode               w 0     0 255
+ 11 1 operating_mode           w 3     0 16
+ 12 1 secondary_id             w 255   0 255
+ 13 1 protocol_type            w 2     2 2
+ 20 4 homing_offset            w 0     -1044479 1044479
+ 24 4 moving_threshold         w 10    0 1023
+ 31 1 temperature_limit        w 80    0 100
+ 32 2 max_voltage_limit        w 160   95 160
+ 34 2 min_voltage_limit        w 95    95 160
+ 36 2 pwm_limit                w 885   0 885
+ 38 2 current_limit            w 1193  0 1193
+ 44 4 velocity_limit           w 200   0 1023
+ 48 4 max_position_limit       w 4095  0 4095
+ 52 4 min_position_limit       w 0     0 4095
+ 63 1 shutdown                 w 52    0 63
+"""
+_RAM = """
+ 64 1 torque_enable            w 0     0 1
+ 65 1 led                      w 0     0 1
+ 68 1 status_return_level      w 2     0 2
+ 69 1 registered_instruction   r 0
+ 70 1 hardware_error_status    r 0
+ 98 1 bus_watchdog             w 0     0 127
+100 2 goal_pwm                 w -     -32768 32767
+102 2 goal_current             w -     -32768 32767
+104 4 goal_velocity            w 0     -2147483648 2147483647
+108 4 profile_acceleration     w 0     0 32767
+112 4 profile_velocity         w 0     0 32767
+116 4 goal_position            w -     -1048575 1048575
+120 2 realtime_tick            r -
+122 1 moving                   r -
+123 1 moving_status            r -
+124 2 present_pwm              r -     -32768 32767
+126 2 present_current          r -     -32768 32767
+128 4 present_velocity         r -     -2147483648 2147483647
+132 4 present_position         r -     -2147483648 2147483647
+136 4 velocity_trajectory      r -     -2147483648 2147483647
+140 4 position_trajectory      r -     -2147483648 2147483647
+144 2 present_input_voltage    r -
+146 1 present_temperature      r -
+"""
+_ACCELERATION_LIMIT = " 40 4 acceleration_limit       w 32767 0 32767\n"
 _LOAD = "126 2 present_load r - -1000 1000\n"  # instead of a current: 0.1 %
 
+# The P series: the same EEPROM with other bounds, and the RAM area behind address 512.
+_P_BOUNDS = (
+    "baud_rate=1,0,9 homing_offset=0,-2147483648,2147483647 moving_threshold=20,0,2920 "
+    "max_voltage_limit=350,150,350 min_voltage_limit=150,150,350 pwm_limit=2009,0,2009 "
+    "current_limit=4500,0,4500 acceleration_limit=10765,0,4306173 velocity_limit=2920,0,2920 "
+    "max_position_limit=303454,-303750,303750 min_position_limit=-303454,-303750,303750 shutdown=58,0,63 "
+    "led_red=0,0,255 profile_acceleration=0,0,2147483647 profile_velocity=0,0,2147483647 "
+    "goal_position=0,-2147483648,2147483647"
+)
+_X_RAM, _P_RAM = 64, 512
 
-def _series(table: str, without: str = "", **facts: Any) -> dict[str, Any]:
-    """What all models of a series have: a table, less some registers, and `SimulatedModel`'s facts."""
-    return {"registers": [row for row in rows(table) if row.name not in without.split()], **facts}
+
+def _rows(text: str) -> list[TableRegister]:
+    """The registers of a table above."""
+    found = []
+    for line in filter(str.strip, text.splitlines()):
+        address, size, name, access, initial, *bounds = line.split()
+        low, high = (int(b) for b in bounds) if bounds else (0, 256 ** int(size) - 1)
+        first = 0 if initial == "-" else int(initial)
+        found.append(TableRegister(int(address), int(size), name, access == "w", first, low, high))
+    return found
+
+
+def _of_p(register: TableRegister) -> TableRegister:
+    """A register of an X where a P has it."""
+    if register.address < _X_RAM:
+        return register
+    name = "led_red" if register.name == "led" else register.name
+    return replace(register, name=name, address=register.address - _X_RAM + _P_RAM)
+
+
+def _bounded(table: list[TableRegister], changes: str) -> list[TableRegister]:
+    """A table in which some registers have other values: ``name=initial,low,high``."""
+    registers = {register.name: register for register in table}
+    for change in changes.split():
+        name, _, values = change.partition("=")
+        initial, low, high = map(int, values.split(","))
+        registers[name] = replace(registers[name], initial=initial, low=low, high=high)
+    return list(registers.values())
+
+
+_RPM = math.tau / 60
 
 
 _X: dict[str, Any] = {
@@ -85,20 +189,25 @@ _P: dict[str, Any] = {
     "acceleration_unit_rad_per_s2": _RPM / 60, "current_unit_a": 0.001, "voltage_v": 24.0,
 }  # fmt: skip
 
-_X_TABLE, _MX_TABLE = X_EEPROM + X_RAM, X_EEPROM + X_RAM + MX_MORE
-_NO_CURRENT = "current_limit goal_current present_current"
-_SERIES = {
-    "x330_5v": _series(_X_TABLE, **_X330 | {"voltage_v": 5.0}),
-    "x330_12v": _series(_X_TABLE, **_X330),
-    "x430": _series(_X_TABLE, **_X),
-    "x430_24v": _series(_X_TABLE, **_X | {"voltage_v": 24.0, "current_unit_a": 0.00134}),
-    "x540_24v": _series(_X_TABLE, **_X | {"voltage_v": 24.0}),
-    "x430_of_load": _series(_X_TABLE + _LOAD, _NO_CURRENT, **_X),
-    "x430_of_load_2": _series(_X_TABLE + _LOAD, _NO_CURRENT, **_X | {"axes": 2}),
-    "mx": _series(_MX_TABLE, **_X | {"current_unit_a": 0.00336}),
-    "mx_of_load": _series(_MX_TABLE + _LOAD, _NO_CURRENT, **_X),
-    "p42": _series(P_EEPROM + P_RAM, **_P | {"counts_per_turn": 607_500}),
-    "p54": _series(P_EEPROM + P_RAM, **_P | {"counts_per_turn": 1_003_846}),
+_X_TABLE = _rows(_EEPROM + _RAM)
+_MX_TABLE = _rows(_EEPROM + _RAM + _ACCELERATION_LIMIT)
+_P_TABLE = _bounded([_of_p(register) for register in _MX_TABLE], _P_BOUNDS)
+_CURRENT = ("current_limit", "goal_current", "present_current")
+_X_LOAD, _MX_LOAD = (
+    [*(one for one in table if one.name not in _CURRENT), *_rows(_LOAD)] for table in (_X_TABLE, _MX_TABLE)
+)
+_SERIES: Mapping[str, Mapping[str, Any]] = {
+    "x330_5v": _X330 | {"registers": _X_TABLE, "voltage_v": 5.0},
+    "x330_12v": _X330 | {"registers": _X_TABLE},
+    "x430": _X | {"registers": _X_TABLE},
+    "x430_24v": _X | {"registers": _X_TABLE, "voltage_v": 24.0, "current_unit_a": 0.00134},
+    "x540_24v": _X | {"registers": _X_TABLE, "voltage_v": 24.0},
+    "x430_of_load": _X | {"registers": _X_LOAD},
+    "x430_of_load_2": _X | {"registers": _X_LOAD, "axes": 2},
+    "mx": _X | {"registers": _MX_TABLE, "current_unit_a": 0.00336},
+    "mx_of_load": _X | {"registers": _MX_LOAD},
+    "p42": _P | {"registers": _P_TABLE, "counts_per_turn": 607_500},
+    "p54": _P | {"registers": _P_TABLE, "counts_per_turn": 1_003_846},
 }
 
 _XL330 = "max_voltage_limit=70,31,70 min_voltage_limit=35,31,70 current_limit=1750,0,1750 shutdown=53,0,63"
@@ -153,14 +262,8 @@ _ROWS = (
 def _model(row: str) -> SimulatedModel:
     """One row of the table."""
     name, number, series, *changes = row.split()
-    facts = dict(_SERIES[series])
-    registers = {register.name: register for register in facts.pop("registers")}
-    for change in changes:
-        register, _, values = change.partition("=")
-        initial, low, high = map(int, values.split(","))
-        registers[register] = replace(registers[register], initial=initial, low=low, high=high)
-    table = tuple(sorted(registers.values(), key=lambda register: register.address))
-    return SimulatedModel(name=name, number=int(number), registers=table, **facts)
+    table = sorted(_bounded(_SERIES[series]["registers"], " ".join(changes)), key=lambda one: one.address)
+    return replace(SimulatedModel(name, int(number), **_SERIES[series]), registers=tuple(table))
 
 
 MODELS: Mapping[str, SimulatedModel] = {model.name: model for model in map(_model, _ROWS)}
@@ -178,3 +281,18 @@ def model_named(name: str) -> SimulatedModel:
         if known in MODELS:
             return MODELS[known]
     raise BadOptions(f"there is no servo model {name!r} to simulate{nearest(plain, MODELS)}")
+
+
+BAUD_RATES: tuple[int, ...] = (
+    9600,
+    57600,
+    115200,
+    1_000_000,
+    2_000_000,
+    3_000_000,
+    4_000_000,
+    4_500_000,
+    6_000_000,
+    10_500_000,
+)
+"""Bits a second by the value of the register Baud Rate."""

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from drivers.errors import BadOptions
-from drivers.sim.wire.axis import WireAxis
+from drivers.sim.axis import WireAxis
 from drivers.sim.wire.dynamixel_drive import Drive
-from drivers.sim.wire.dynamixel_models import SimulatedModel, model_named
-from drivers.sim.wire.dynamixel_registers import BAUD_RATES
+from drivers.sim.wire.dynamixel_models import BAUD_RATES, SimulatedModel, model_named
 from drivers.sim.wire.dynamixel_table import (
     MODES,
     WATCHDOG_EXPIRED,

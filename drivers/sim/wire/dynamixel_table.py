@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from drivers.sim.wire.dynamixel_models import SimulatedModel
-from drivers.sim.wire.dynamixel_registers import TableRegister
+from drivers.sim.wire.dynamixel_models import SimulatedModel, TableRegister
 
 INSTRUCTION_ERROR = 0x02
 CRC_ERROR = 0x03

@@ -1,7 +1,8 @@
-"""The ends of a simulated line that another program can open: a pseudo terminal or a TCP port.
+"""The ends of a simulated line: a pseudo terminal or a TCP port for any program, or memory for this process.
 
 On a pseudo terminal the host's bytes count only at the device's baud rate, as on a real line, and both
-directions take 10 bits a byte.
+directions take 10 bits a byte. A line in memory waits on the clock that it is given: on one that is turned, a
+driver at one end and a simulator at the other need no real time.
 """
 
 from __future__ import annotations
@@ -17,31 +18,153 @@ import struct
 import tempfile
 import tty
 from abc import abstractmethod
+from collections import deque
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from drivers.clock import Clock
-from drivers.errors import BadOptions
+from drivers.errors import BadOptions, LineLost
 from drivers.faults import FaultPanel
-from drivers.sim.wire.carrier import Line, Observer
-from drivers.sim.wire.carrier import Reply as Reply
-from drivers.sim.wire.carrier import WireDevice as WireDevice
+from drivers.sim.wire.carrier import Line, Observer, WireDevice
 
 _TCGETS2 = 0x802C542A  # asm-generic/ioctls.h; struct termios2: 4 flags, line, 19 characters, 2 speeds
+PATH = "memory"
+ROOM_BYTES = 4096
+"""What waits for a host that does not read; more is lost, as on a pseudo terminal."""
 
 
-class _KernelLine(Line):
-    """A line whose host is beyond the kernel: its thread waits in real time."""
+class MemoryLine(Line):
+    """A serial line in memory; a context manager."""
+
+    path = PATH
 
     def __init__(
         self,
         device: WireDevice,
         clock: Clock,
-        faults: FaultPanel | None,
-        wire_time: bool,
-        observer: Observer | None,
+        faults: FaultPanel | None = None,
+        *,
+        wire_time: bool = True,
+        observer: Observer | None = None,
     ) -> None:
-        super().__init__(device, clock, faults, wire_time, observer)
+        super().__init__(device, clock, faults, wire_time=wire_time, observer=observer)
+        self._host: MemoryEnd | None = None
+        self._sent: deque[tuple[bytes, int]] = deque()  # by hosts, each at its speed
+        self._woken = False
+        self._thread.start()
+
+    def open(self, port: str, baud: int, device: str = "") -> MemoryEnd:
+        """Return the host's end of the line, a `drivers.serial_line.ByteLine`; arguments as of `SerialLine`.
+
+        Raises LineLost if another host has it, it is hung up, or ``port`` is another.
+        """
+        detail = {"port": port, "while": "opening it"}
+        if port != self.path or not self._up:
+            raise LineLost(f"{port} cannot be opened: no such file", device=device, detail=detail)
+        if self._host is not None and self._host.state == "open":
+            raise LineLost(f"{port} cannot be opened: held by another program", device=device, detail=detail)
+        self._host = MemoryEnd(self, self._clock, baud, device)
+        return self._host
+
+    def put(self, data: bytes, baud: int) -> None:
+        """Take bytes of a host."""
+        with self._changed:
+            self._sent.append((data, baud))
+            self._changed.notify_all()
+
+    def _connect(self) -> None:
+        pass
+
+    def _disconnect(self) -> None:
+        if self._host is not None:
+            self._host.end("hung up")
+            self._host = None
+        self._sent.clear()
+
+    def _listen(self, wait_s: float) -> bytes:
+        with self._changed:
+            if not (self._sent or self._woken):
+                self._changed.wait(wait_s, idle=True)
+            self._woken = False
+            if not self._sent:
+                return b""
+            data, baud = self._sent.popleft()
+        return self._understood(data, baud)
+
+    def _wake(self) -> None:
+        with self._changed:
+            self._woken = True
+            self._changed.notify_all()
+
+    def _give(self, data: bytes) -> None:
+        if self._host is not None:
+            self._host.take(self._heard(data, self._host.baud))
+
+
+class MemoryEnd:
+    """The host's end of a line in memory (`drivers.serial_line.ByteLine`); closing twice does no harm."""
+
+    def __init__(self, line: MemoryLine, clock: Clock, baud: int, device: str) -> None:
+        self.port = line.path
+        self.baud = baud
+        self.byte_s = 10.0 / baud
+        self.state = "open"
+        self._line = line
+        self._clock = clock
+        self._device = device
+        self._arrived = clock.signal()
+        self._buffer = bytearray()
+
+    def write(self, data: bytes) -> None:
+        """Send bytes. Raises LineLost."""
+        self._check("writing")
+        self._line.put(data, self.baud)
+
+    def read(self, wait_s: float) -> bytes:
+        """Return the bytes that have come or come within ``wait_s``, as soon as there are any; else none.
+
+        Raises LineLost.
+        """
+        until_s = self._clock.now_s() + wait_s
+        with self._arrived:
+            while True:
+                self._check("reading")
+                left_s = until_s - self._clock.now_s()
+                if self._buffer or left_s <= 0:
+                    data = bytes(self._buffer)
+                    self._buffer.clear()
+                    return data
+                self._arrived.wait(left_s)
+
+    def close(self) -> None:
+        """Let go of the line, whatever state it is in."""
+        self.end("closed")
+
+    def take(self, data: bytes) -> None:
+        """Take bytes of the device; what there is no room for is lost."""
+        with self._arrived:
+            self._buffer += data[: ROOM_BYTES - len(self._buffer)]
+            self._arrived.notify_all()
+
+    def end(self, state: str) -> None:
+        """Have every call fail from now on."""
+        with self._arrived:
+            if self.state == "open":
+                self.state = state
+            self._arrived.notify_all()
+
+    def _check(self, doing: str) -> None:
+        if self.state != "open":
+            message = f"{self.port} {self.state} (unplugged?)"
+            raise LineLost(message, device=self._device, detail={"port": self.port, "while": doing})
+
+
+class _KernelLine(Line):
+    """A line whose host is beyond the kernel: its thread waits in real time."""
+
+    def __init__(self, *line: Any, **options: Any) -> None:
+        super().__init__(*line, **options)
         self._wake_read, self._wake_write = os.pipe()
 
     @abstractmethod
@@ -68,23 +191,11 @@ class _KernelLine(Line):
 
 
 class PtyLine(_KernelLine):
-    """A serial line as a pseudo terminal; a context manager.
+    """A serial line as a pseudo terminal; a context manager. Its clock has to run by itself.
 
-    Raises BadOptions if ``link`` cannot be made there.
-
-    Parameters
-    ----------
-    clock
-        Time for the device: one that runs by itself (``SystemClock``), since the line waits in real time.
-    link
-        A stable path to make, a symbolic link to the terminal; one of the line's own when left out.
-    wire_time
-        Whether bytes take time and the host has to set the device's baud rate to be understood.
-
-    Attributes
-    ----------
-    path
-        What a host opens. It is gone while the line is hung up, and the same when it has come back.
+    A host opens ``path``: the symbolic link ``link``, or one of the line's own. It is gone while the line is
+    hung up, and the same when it has come back. With ``wire_time`` bytes take time, and the host has to set
+    the device's baud rate to be understood. Raises BadOptions if the link cannot be made there.
     """
 
     def __init__(
@@ -97,7 +208,7 @@ class PtyLine(_KernelLine):
         wire_time: bool = True,
         observer: Observer | None = None,
     ) -> None:
-        super().__init__(device, clock, faults, wire_time, observer)
+        super().__init__(device, clock, faults, wire_time=wire_time, observer=observer)
         self._folder: str | None = None
         if link is None:
             self._folder = tempfile.mkdtemp(prefix="mastctl-line-")
@@ -147,7 +258,7 @@ class PtyLine(_KernelLine):
         if self._master not in ready:
             return b""
         data = os.read(self._master, 4096)
-        return self._understood(data, self._host_baud() if self._wire_time else 0)
+        return self._understood(data, self._host_baud())
 
     def _host_baud(self) -> int:
         """The speed that the host has set on its end."""
@@ -155,7 +266,7 @@ class PtyLine(_KernelLine):
         return int(struct.unpack_from("I", state, 40)[0])
 
     def _give(self, data: bytes) -> None:
-        data = self._heard(data, self._host_baud() if self._wire_time else 0)
+        data = self._heard(data, self._host_baud())
         try:
             os.write(self._master, data)
         except OSError as error:
@@ -164,11 +275,9 @@ class PtyLine(_KernelLine):
 
 
 class TcpLine(_KernelLine):
-    """A device behind a TCP port, one host at a time; a context manager.
+    """A device behind a TCP port, one host at a time; bytes take no time. A context manager.
 
-    Raises BadOptions if it cannot listen there.
-
-    Parameters are as of `PtyLine`; bytes usually take no time: the network is faster than the device.
+    Port 0 is any free one. Raises BadOptions if it cannot listen there.
     """
 
     def __init__(
@@ -180,10 +289,9 @@ class TcpLine(_KernelLine):
         port: int = 0,
         *,
         banner: bytes = b"",
-        wire_time: bool = False,
         observer: Observer | None = None,
     ) -> None:
-        super().__init__(device, clock, faults, wire_time, observer)
+        super().__init__(device, clock, faults, wire_time=False, observer=observer)
         self.host, self.port = host, port
         self._banner = banner
         self._listener: socket.socket | None = None

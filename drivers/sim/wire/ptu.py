@@ -14,10 +14,9 @@ from dataclasses import dataclass
 
 from drivers.errors import BadOptions
 from drivers.faults import nearest
-from drivers.sim.wire.axis import WireAxis
+from drivers.sim.axis import WireAxis
 from drivers.sim.wire.carrier import Reply
-from drivers.sim.wire.ptu_axis import MODELS, STEPS, PtuAxis
-from drivers.sim.wire.ptu_unit import CommandRefused, PtuUnit
+from drivers.sim.wire.ptu_unit import MODELS, STEPS, CommandRefused, PtuAxis, PtuUnit
 
 BAUD_RATES = (600, 1200, 2400, 4800, 9600, 19200, 38400, 57600, 115200)
 _WORDS = re.compile(r"([A-Z]+)([+-]?\d+)?")
@@ -144,7 +143,7 @@ _PLAIN: Mapping[str, _Plain] = {
 
 
 class SimulatedPtu:
-    """A unit on a line (``drivers.sim.wire.line.WireDevice``).
+    """A unit on a line (``drivers.sim.wire.carrier.WireDevice``).
 
     Raises BadOptions for a model, step mode or baud rate that does not exist.
     """

@@ -16,13 +16,11 @@ from drivers.dynamixel.head import DynamixelHead, open_head
 from drivers.errors import DriverError
 from drivers.faults import FaultPanel
 from drivers.interfaces import PanTilt, Reading
-from drivers.sim.axis import AxisSettings
-from drivers.sim.wire.axis import WireAxis
+from drivers.sim.axis import AxisSettings, WireAxis
 from drivers.sim.wire.carrier import WireDevice
-from drivers.sim.wire.dynamixel_bus import DynamixelBus
-from drivers.sim.wire.dynamixel_packets import Instruction, InstructionParser
+from drivers.sim.wire.dynamixel_bus import DynamixelBus, Instruction, InstructionParser
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
-from drivers.sim.wire.memory_line import MemoryLine
+from drivers.sim.wire.line import MemoryLine
 from drivers.simulation_clock import SimulationClock
 from hil_tests.drivers.turned import START_S, HangingHost, Turned
 

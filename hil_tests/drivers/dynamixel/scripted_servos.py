@@ -13,9 +13,8 @@ from drivers.dynamixel.link import Link
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.exchange import REPLY_TIMEOUT_S
 from drivers.sim.wire.carrier import Reply
-from drivers.sim.wire.dynamixel_packets import Instruction, InstructionParser, status_packet
-from drivers.sim.wire.line import PtyLine
-from drivers.sim.wire.memory_line import MemoryLine
+from drivers.sim.wire.dynamixel_bus import Instruction, InstructionParser, status_packet
+from drivers.sim.wire.line import MemoryLine, PtyLine
 from drivers.simulation_clock import SimulationClock
 from hil_tests.drivers.turned import START_S, Turned
 
@@ -26,7 +25,7 @@ Answer = Callable[[Instruction, int], Sequence[Reply]]
 
 
 class ScriptedServos:
-    """A line's far end (`drivers.sim.wire.line.WireDevice`) that hands each instruction to a function."""
+    """A line's far end (`drivers.sim.wire.carrier.WireDevice`) that hands each instruction to a function."""
 
     baud = BAUD_RATE
 

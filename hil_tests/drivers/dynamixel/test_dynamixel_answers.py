@@ -17,8 +17,7 @@ import pytest
 from drivers.errors import DriverError
 from drivers.interfaces import Reading
 from drivers.sim.wire.carrier import Reply
-from drivers.sim.wire.dynamixel_bus import DynamixelBus
-from drivers.sim.wire.dynamixel_packets import unstuffed
+from drivers.sim.wire.dynamixel_bus import DynamixelBus, unstuffed
 from drivers.sim.wire.dynamixel_servo import VOLTAGE, SimulatedServo
 from hil_tests.drivers.dynamixel.dynamixel_rig import COUNT_RAD, Rig, failed, opened, rig
 

@@ -13,7 +13,7 @@ import pytest
 
 from drivers.dynamixel import models as driver
 from drivers.dynamixel import packets
-from drivers.sim.wire import dynamixel_models, dynamixel_registers, dynamixel_servo, dynamixel_table
+from drivers.sim.wire import dynamixel_models, dynamixel_servo, dynamixel_table
 
 # _includes/en/dxl/control_table_baudrate_2.md (X and MX: 0 to 7, XL330 and XC330: 0 to 6) and
 # _includes/en/dxl/p/control_table_8_baud_rate.md (P: 0 to 9).
@@ -50,7 +50,7 @@ CURRENT_LIMITS = {
 
 def test_both_have_the_makers_codes_of_baud_rates() -> None:
     assert dict(driver.BAUD_RATES) == BAUD_OF_CODE
-    assert dict(enumerate(dynamixel_registers.BAUD_RATES)) == BAUD_OF_CODE
+    assert dict(enumerate(dynamixel_models.BAUD_RATES)) == BAUD_OF_CODE
     for model, highest in HIGHEST_CODE.items():
         assert dynamixel_models.model_named(model).by_name["baud_rate"].high == highest, model
 

@@ -20,7 +20,7 @@ from drivers.serial_line import SerialLine
 from drivers.servo_bus.bus import Bus
 from drivers.servo_bus.port import Part
 from drivers.sim.wire.carrier import Reply
-from drivers.sim.wire.dynamixel_packets import Instruction
+from drivers.sim.wire.dynamixel_bus import Instruction
 from hil_tests.drivers.dynamixel.scripted_servos import BAUD_RATE, number, says, scripted
 from hil_tests.drivers.turned import turned
 from hil_tests.waiting import NET_S

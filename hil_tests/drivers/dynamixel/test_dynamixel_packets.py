@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from drivers.dynamixel import packets
 from drivers.dynamixel.packets import crc16, instruction_packet, take_status
-from drivers.sim.wire import dynamixel_packets as wire
+from drivers.sim.wire import dynamixel_bus as wire
 
 PING, READ, WRITE, SYNC_READ = 1, 2, 3, 0x82
 

@@ -18,9 +18,9 @@ from drivers.dynamixel.servo import Servo
 from drivers.errors import DriverError, LineLost, NoReply
 from drivers.servo_bus.bus import Bus
 from drivers.servo_bus.head import CLOSE_TIMEOUT_S
-from drivers.sim.wire.axis import WireAxis
+from drivers.sim.axis import WireAxis
 from drivers.sim.wire.carrier import Reply
-from drivers.sim.wire.dynamixel_packets import BROADCAST, Instruction
+from drivers.sim.wire.dynamixel_bus import BROADCAST, Instruction
 from drivers.sim.wire.dynamixel_servo import VOLTAGE
 from hil_tests.drivers.dynamixel.dynamixel_rig import (
     COUNT_RAD,

@@ -10,7 +10,7 @@ import math
 import pytest
 
 from drivers.feetech import servos as driver
-from drivers.sim.wire import feetech_memory, feetech_servo
+from drivers.sim.wire import feetech_servo
 
 # SMS_STS.h of 2021-12-08 and 2025-02-26 (SMS_STS_1M 0 ... SMS_STS_38400 7), SCSCL.h of 2018-07-03 and
 # 2020-06-17 (SCSCL_1M 0 ... SCSCL_38400 7), and address 6 of the memory tables of STS and SCSCL servos.
@@ -43,7 +43,7 @@ ADDRESSES = {"STS3215": BOTH + OF_STS, "SCS0009": BOTH + OF_SCS}
 
 def test_both_have_the_makers_codes_of_baud_rates() -> None:
     assert dict(enumerate(driver.BAUD_RATES)) == BAUD_OF_CODE
-    assert dict(enumerate(feetech_memory.BAUDS)) == BAUD_OF_CODE
+    assert dict(enumerate(feetech_servo.BAUDS)) == BAUD_OF_CODE
 
 
 def test_both_have_the_makers_status_bits() -> None:
@@ -60,12 +60,12 @@ def test_both_have_the_makers_status_bits() -> None:
 def test_both_have_the_known_model_numbers() -> None:
     named = {model.name.lower(): number for number, model in driver.MODELS_BY_NUMBER.items()}
     assert named == MODEL_NUMBERS
-    assert {name: model.number for name, model in feetech_memory.MODELS.items()} == MODEL_NUMBERS
+    assert {name: model.number for name, model in feetech_servo.MODELS.items()} == MODEL_NUMBERS
 
 
 @pytest.mark.parametrize("model", ADDRESSES)
 def test_both_have_the_makers_addresses(model: str) -> None:
-    registers, cells = driver.MODELS[model].registers, feetech_memory.model_named(model).by_name
+    registers, cells = driver.MODELS[model].registers, feetech_servo.model_named(model).by_name
     for ours, theirs, address in ADDRESSES[model]:
         assert (registers[ours].address, cells[theirs].address) == (address, address), ours
 
@@ -74,7 +74,7 @@ def test_both_count_as_the_maker_does() -> None:
     # memory tables: 0.087 degrees a step (STS), 1024 steps over 300 degrees (SCS); low byte first (STS), high
     # byte first (SCS), by END at address 2; a current of 6.5 mA, an acceleration of 100 steps/s2
     for name, turn_deg, counts, big in (("STS3215", 360, 4096, False), ("SCS0009", 300, 1024, True)):
-        ours, theirs = driver.MODELS[name], feetech_memory.model_named(name)
+        ours, theirs = driver.MODELS[name], feetech_servo.model_named(name)
         count_rad = math.radians(turn_deg) / counts
         assert ours.count_rad == pytest.approx(count_rad) and theirs.count_rad == pytest.approx(count_rad)
         assert (ours.is_scs, theirs.big_end) == (big, big)

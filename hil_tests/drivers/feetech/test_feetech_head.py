@@ -28,11 +28,10 @@ from drivers.feetech.head import FeetechHead, FeetechServo, halt, open_head
 from drivers.feetech.servos import FeetechLink
 from drivers.servo_bus.bench import ServoBench
 from drivers.servo_bus.exchange import BusLink
-from drivers.sim.axis import AxisSettings
-from drivers.sim.wire.axis import WireAxis
+from drivers.sim.axis import AxisSettings, WireAxis
 from drivers.sim.wire.feetech_bus import FeetechBus
 from drivers.sim.wire.feetech_servo import SimulatedFeetechServo
-from drivers.sim.wire.memory_line import MemoryLine
+from drivers.sim.wire.line import MemoryLine
 from drivers.simulation_clock import SimulationClock
 from hil_tests.drivers.turned import START_S, HangingHost, Turned
 from mastctl.cli.main import main

@@ -14,7 +14,7 @@ from typing import Any
 
 from drivers.flir_ptu.head import FlirPtu, open_head
 from drivers.sim.wire.carrier import Reply
-from drivers.sim.wire.memory_line import MemoryLine
+from drivers.sim.wire.line import MemoryLine
 from drivers.simulation_clock import SimulationClock
 from hil_tests.waiting import until
 
@@ -24,7 +24,7 @@ OPTIONS: dict[str, Any] = {
 
 
 class ScriptedPtu:
-    """A unit on a simulated line (`drivers.sim.wire.line.WireDevice`).
+    """A unit on a simulated line (`drivers.sim.wire.carrier.WireDevice`).
 
     Attributes
     ----------

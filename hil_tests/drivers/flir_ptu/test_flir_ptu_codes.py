@@ -11,9 +11,8 @@ from drivers.flir_ptu import protocol
 from drivers.flir_ptu.options import BAUDS
 from drivers.flir_ptu.protocol import answer_of, number_of
 from drivers.flir_ptu.unit import supply_of
-from drivers.sim.axis import AxisSettings
+from drivers.sim.axis import AxisSettings, WireAxis
 from drivers.sim.wire import ptu
-from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.ptu import SimulatedPtu
 
 D46_MANUAL = "PTU-D46 User's Manual 2.14.0"

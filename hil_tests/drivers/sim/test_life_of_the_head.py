@@ -11,11 +11,10 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from drivers.clock import ManualClock
-from drivers.sim.axis import AxisSettings
+from drivers.sim.axis import AxisSettings, WireAxis
 from drivers.sim.heads import HeadModel, head_settings
 from drivers.sim.motion import Motion
 from drivers.sim.pan_tilt import SimulatedPanTilt
-from drivers.sim.wire.axis import WireAxis
 
 AXIS = AxisSettings(1e-5, 0.0, -1.5, 1.5, 1.0, 2.0)
 RINGING = replace(AXIS, ring_hz=6.0, ring_damping=0.03)

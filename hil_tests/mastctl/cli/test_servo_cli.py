@@ -13,11 +13,10 @@ import pytest
 
 from drivers.servo_bus.bench import ServoBench
 from drivers.servo_bus.exchange import BusLink
-from drivers.sim.axis import AxisSettings
-from drivers.sim.wire.axis import WireAxis
+from drivers.sim.axis import AxisSettings, WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_servo import OVERLOAD, SimulatedServo
-from drivers.sim.wire.memory_line import MemoryLine
+from drivers.sim.wire.line import MemoryLine
 from drivers.simulation_clock import SimulationClock
 from mastctl.cli.main import main
 from mastctl.safety import heads

@@ -24,14 +24,14 @@ from drivers.feetech.head import feetech_settings
 from drivers.flir_ptu.options import options_from
 from drivers.probes import ProbedCamera
 from drivers.servo_bus.bench import FoundServo, ServosOnLine
+from drivers.sim.axis import WireAxis
 from drivers.sim.heads import PRESETS, HeadModel
-from drivers.sim.wire.axis import WireAxis
+from drivers.sim.wire.carrier import WireDevice
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
 from drivers.sim.wire.feetech_bus import FeetechBus
 from drivers.sim.wire.feetech_servo import SimulatedFeetechServo
-from drivers.sim.wire.line import WireDevice
-from drivers.sim.wire.memory_line import MemoryLine
+from drivers.sim.wire.line import MemoryLine
 from drivers.sim.wire.ptu import SimulatedPtu
 from drivers.simulation_clock import SimulationClock
 from drivers.v4l2.options import parse_options

@@ -18,14 +18,14 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
 from drivers.clock import SystemClock
 from drivers.faults import FaultPanel
+from drivers.sim.axis import WireAxis
 from drivers.sim.camera_settings import CameraSettings
 from drivers.sim.cameras import SimulatedCamera
 from drivers.sim.heads import PRESETS
 from drivers.sim.render import Renderer, compile_renderer
 from drivers.sim.scene import SceneSettings, build_scene
-from drivers.sim.wire.axis import WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
-from drivers.sim.wire.dynamixel_registers import BAUD_RATES
+from drivers.sim.wire.dynamixel_models import BAUD_RATES
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
 from drivers.sim.wire.line import PtyLine
 from drivers.v4l2.controls import list_controls, set_value

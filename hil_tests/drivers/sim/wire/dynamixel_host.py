@@ -13,8 +13,7 @@ from typing import Any
 from dynamixel_sdk import GroupSyncRead, PacketHandler
 
 from drivers.clock import ManualClock
-from drivers.sim.axis import AxisSettings
-from drivers.sim.wire.axis import WireAxis
+from drivers.sim.axis import AxisSettings, WireAxis
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
 

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from drivers.sim.wire.axis import WireAxis
+from drivers.sim.axis import WireAxis
 from drivers.sim.wire.dynamixel_servo import BOOT_S
 from hil_tests.drivers.sim.wire.dynamixel_host import SETTINGS, Host, axis, servo
 

@@ -7,7 +7,7 @@ from dynamixel_sdk import PacketHandler
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.sim.wire.dynamixel_packets import (
+from drivers.sim.wire.dynamixel_bus import (
     Instruction,
     InstructionParser,
     crc16,

@@ -8,8 +8,7 @@ import pytest
 
 from drivers.clock import ManualClock
 from drivers.faults import FaultPanel
-from drivers.sim.axis import AxisSettings
-from drivers.sim.wire.axis import WireAxis
+from drivers.sim.axis import AxisSettings, WireAxis
 from drivers.sim.wire.ptu import SimulatedPtu
 
 AXIS = AxisSettings(
