@@ -406,7 +406,7 @@ def test_the_commands_follow_a_target(
     assert (code, json.loads(out)["state"]) == (0, "tracking")
     far = ("--position", "9", "0", "0", "--sigma", "0.01", "0.005", "--time", "3")
     code, out, _ = run(daemon, capsys, "pose", *far)
-    shown = "state lost, pair navcam, position m -4, 0.5, 0, predicted yes"
+    shown = "state lost, pair navcam, range m 5, position m -4, 0.5, 0, predicted yes"
     assert (code, out.partition(", reason")[0]) == (0, shown)
     code, out, log = run(daemon, capsys, "pose", "--position", "0.5", "0", "0", "--time", "1")
     assert (code, out) == (1, "")
