@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gzip
+import io
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,8 +15,6 @@ from calib.errors import BadFile
 from calib.files import CameraFile, read_bytes
 from calib.files.atomic import save_bytes
 from calib.files.cahvor_text import internal_parameters, looks_like_cahvor, parse_cahvor, save_cahvor
-from calib.files.file_storage import looks_like_storage, unzipped
-from calib.files.foreign import lens_pose
 from calib.files.mast_file import CAMERA_SCHEMA, StoredRig, parse_camera, parse_rig, save_camera
 from calib.files.mrcal_kalibr import (
     format_kalibr,
@@ -27,6 +28,7 @@ from calib.files.opencv_ros import (
     format_camera_info,
     format_opencv,
     looks_like_calibration,
+    looks_like_storage,
     parse_calibration,
     read_document,
 )
@@ -93,7 +95,7 @@ def load_any(path: str | Path) -> StoredRig | CameraFile | dict[str, CameraFile]
     The content shows the format. Where it does not, the suffix decides which format's refusal helps most.
     Raises BadFile if the file is none of these, or is one but malformed.
     """
-    data = unzipped(read_bytes(path, MAX_FILE_BYTES), MAX_FILE_BYTES, path)
+    data = _unzipped(read_bytes(path, MAX_FILE_BYTES), path)
     suffix = Path(str(path).lower().removesuffix(".gz")).suffix
     if looks_like_mrcal(data) or suffix == ".cameramodel":
         return parse_mrcal(data, path)
@@ -116,6 +118,20 @@ def load_any(path: str | Path) -> StoredRig | CameraFile | dict[str, CameraFile]
     if refusal is not None and (looks_like_storage(data) or suffix in (".yaml", ".yml", ".xml", ".json")):
         raise refusal
     raise BadFile(path, "", f"is not one of these formats: {KNOWN_FORMATS}")
+
+
+def _unzipped(data: bytes, path: str | Path) -> bytes:
+    """The bytes, those of a gzip file unpacked."""
+    if not data.startswith(b"\x1f\x8b"):
+        return data
+    try:
+        with gzip.open(io.BytesIO(data)) as file:
+            found = file.read(MAX_FILE_BYTES + 1)
+    except (OSError, EOFError, zlib.error) as error:
+        raise BadFile(path, "", f"is no whole gzip file: {error}") from None
+    if len(found) > MAX_FILE_BYTES:
+        raise BadFile(path, "", f"unpacks to more than {MAX_FILE_BYTES} bytes, the most that is read")
+    return found
 
 
 @dataclass(frozen=True)
@@ -286,7 +302,7 @@ def _lost(
     lost = []
     if to == "ros":
         for name, twin in twins.items():
-            pose = lens_pose(twin)
+            pose = twin.pose
             rows = ", ".join(f"[{', '.join(f'{value:.9g}' for value in row)}]" for row in pose.rotation)
             where = ", ".join(f"{value:.9g}" for value in pose.translation_m)
             lost.append(

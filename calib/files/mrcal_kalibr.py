@@ -31,21 +31,18 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import BadFile
 from calib.files import UNKNOWN_FRAME, CameraFile, build_model, digest_of
-from calib.files.foreign import (
-    LENSES,
+from calib.files.mast_file import SizePx
+from calib.files.opencv_ros import (
     Numbers,
     Source,
-    coefficients,
+    intrinsics_of,
     lens_camera,
     lens_numbers,
-    lens_pose,
     matrix44,
-    matrix_of,
     pose_of,
+    read_document,
     read_foreign,
 )
-from calib.files.mast_file import SizePx
-from calib.files.opencv_ros import read_document
 from calib.files.records import ABSENT, Number, Record, Text
 from calib.files.twin import FISHEYE
 from calib.files.yaml_text import dump_mapping, kind_of, parse_mapping
@@ -98,7 +95,7 @@ def parse_mrcal(data: bytes, path: str | Path) -> CameraFile:
     bare = _INPUTS.sub(b"", data)
     # A mapping of numbers, texts and lists in Python's form is one in YAML's too.
     keys = parse_mapping(bare, path)
-    record, source = read_foreign(MrcalRecord, keys, path, other_names=_MRCAL_NAMES, ignored=_MRCAL_IGNORED)
+    record, source = read_foreign(MrcalRecord, keys, path, "", _MRCAL_NAMES, _MRCAL_IGNORED)
     if bare != data:
         source.notes.insert(0, "optimization_inputs: not read")
     pose = np.array(record.rt_cam_ref)
@@ -106,9 +103,16 @@ def parse_mrcal(data: bytes, path: str | Path) -> CameraFile:
     name = record.lensmodel.replace("DISTORTION", "LENSMODEL", 1)
     if name in _OPENCV:
         numbers = _counted(source, record, 4 + _OPENCV[name])
-        matrix, size = matrix_of(numbers[:4].tolist()), record.imagersize
+        lens, inner = ("intrinsics", "pinhole"), numbers[:4]
         return lens_camera(
-            source, "pinhole", size, matrix, numbers[4:], frame_from_camera, UNKNOWN_FRAME, digest_of(data)
+            source,
+            lens,
+            numbers[4:],
+            record.imagersize,
+            inner,
+            frame_from_camera,
+            UNKNOWN_FRAME,
+            digest_of(data),
         )
     model, notes = _cahvor(source, record, name, frame_from_camera)
     return CameraFile(model, UNKNOWN_FRAME, {}, {}, (*source.notes, *notes), Path(path), digest_of(data))
@@ -164,8 +168,8 @@ def _cahvor(
 def format_mrcal(camera: CameraModel, frame: str) -> bytes:
     """Return a camera as a .cameramodel; its H and V are at right angles."""
     if camera.kind in FREE:
-        name, pose = f"LENSMODEL_{camera.kind}", lens_pose(camera)
-        numbers = [*camera.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]], *camera.distortion]
+        name, pose = f"LENSMODEL_{camera.kind}", camera.pose
+        numbers = [*intrinsics_of(camera), *camera.distortion]
     else:
         name, numbers, pose = _numbers_of(camera)
     camera_from_frame = pose.inverse
@@ -237,10 +241,16 @@ def parse_kalibr(data: bytes, path: str | Path) -> dict[str, CameraFile]:
         lens = record.distortion_model
         if not record.distortion_coeffs and lens != "none":
             raise source.bad("distortion_coeffs", f"no numbers where 4 are expected for '{lens}'")
-        distortion = coefficients(source, "distortion_coeffs", lens, record.distortion_coeffs)
-        size, matrix, pose = record.resolution, matrix_of(record.intrinsics), camera_from_frame.inverse
-        family = LENSES[lens][0]
-        cameras[name] = lens_camera(source, family, size, matrix, distortion, pose, frame, digest_of(data))
+        cameras[name] = lens_camera(
+            source,
+            ("distortion_coeffs", lens),
+            record.distortion_coeffs,
+            record.resolution,
+            record.intrinsics,
+            camera_from_frame.inverse,
+            frame,
+            digest_of(data),
+        )
     return cameras
 
 
@@ -249,16 +259,15 @@ def format_kalibr(cameras: Mapping[str, CameraModel], frame: str) -> bytes:
     chain: dict[str, dict[str, object]] = {}
     before = Rigid.identity()
     for at, (name, camera) in enumerate(cameras.items()):
-        pose = lens_pose(camera)
         chain[f"cam{at}"] = {
             "camera_model": "pinhole",
-            "intrinsics": camera.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]],
+            "intrinsics": intrinsics_of(camera),
             "distortion_model": "equidistant" if camera.kind == FISHEYE else "radtan",
             "distortion_coeffs": lens_numbers(camera),
             "resolution": camera.size_px,
             "rostopic": f"/{name}/image_raw",
-            "T_cn_cnm1": matrix44(pose.inverse @ before),
+            "T_cn_cnm1": matrix44(camera.pose.inverse @ before),
         }
-        before = pose
+        before = camera.pose
     head = f"# T_cn_cnm1 of cam0 maps coordinates in the frame {frame!r}, metres, to cam0's\n"
     return head.encode() + dump_mapping(chain)

@@ -16,7 +16,6 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from calib.files.foreign import lens_pose
 from calib.files.twin import TwinError, even_axes, nearest_opencv, twin_error
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig, RigCamera
@@ -110,7 +109,7 @@ def transforms(rig: Rig, pan_rad: float, tilt_rad: float, time_ns: int) -> Messa
 def _carrier_from_optical(model: CameraModel) -> Rigid:
     """The frame that the ``plumb_bob`` camera of `calibration` is in; its own axes if there is none."""
     try:
-        return lens_pose(_nearest(model)[0])
+        return _nearest(model)[0].pose
     except ValueError:
         return Rigid(even_axes(model), model.C)
 

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from calib.files.any_camera import nearest_lens
-from calib.files.foreign import lens_pose
 from calib.files.twin import TwinError, even_axes
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
@@ -64,7 +63,7 @@ class KnownState:
     def carrier_from_optical(self, rig: Rig, camera: str) -> Rigid:
         """Return the optical frame that a camera's K and D are in, in the frame of what carries it."""
         if camera in self.lenses:
-            return lens_pose(self.lenses[camera][1])
+            return self.lenses[camera][1].pose
         model = rig.cameras[camera].model
         return Rigid(even_axes(model), model.C)
 
