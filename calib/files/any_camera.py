@@ -6,15 +6,15 @@ import gzip
 import io
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from calib.errors import BadFile
-from calib.files import CameraFile, read_bytes
+from calib.files import UNKNOWN_FRAME, CameraFile, read_bytes
 from calib.files.atomic import save_bytes
-from calib.files.cahvor_text import internal_parameters, looks_like_cahvor, parse_cahvor, save_cahvor
+from calib.files.cahvor_text import format_cahvor, internal_parameters, looks_like_cahvor, parse_cahvor
 from calib.files.mast_file import CAMERA_SCHEMA, StoredRig, parse_camera, parse_rig, save_camera
 from calib.files.mrcal_kalibr import (
     format_kalibr,
@@ -71,7 +71,7 @@ LENSES: dict[str, Kind] = {
 """The lenses that can be requested, by the kind that a camera then is."""
 
 _OFFERED: dict[str, tuple[str, ...]] = {
-    "opencv": ("plumb_bob", "rational_polynomial", "equidistant", "tilted"),
+    "opencv": ("plumb_bob", "rational_polynomial", "equidistant"),
     "ros": ("plumb_bob", "rational_polynomial", "equidistant"),
     "kalibr": ("radtan", "equidistant"),
     "mrcal": ("cahvor", "plumb_bob", "rational_polynomial"),
@@ -205,21 +205,20 @@ def save_any(
         save_camera(only, path)
         return Conversion(Path(path), CAMERA_SCHEMA, ())
     if to == "cahvor" and only.model.kind not in FREE:
-        return Conversion(Path(path), to, save_cahvor(only, path))
+        save_bytes(path, format_cahvor(only.model))
+        return Conversion(Path(path), to, _lost(cameras, {}, to, only.frame))
     found = {name: _within_limit(name, one.model, path, to, lens, limit_px) for name, one in cameras.items()}
     first, twin, _ = found[name]
-    if to == "cahvor":
-        lost = save_cahvor(replace(only, model=twin, fit={}), path)
-    else:
-        twins = {name: twin for name, (_, twin, _) in found.items()}
-        formatted = {
-            "kalibr": lambda: format_kalibr(twins, only.frame),
-            "ros": lambda: format_camera_info(twin, first, name),
-            "mrcal": lambda: format_mrcal(twin, only.frame),
-            "opencv": lambda: format_opencv(twin, only.frame),
-        }
-        save_bytes(path, formatted[to]())
-        lost = _lost(cameras, twins, to, only.frame)
+    twins = {name: twin for name, (_, twin, _) in found.items()}
+    formatted = {
+        "cahvor": lambda: format_cahvor(twin),
+        "kalibr": lambda: format_kalibr(twins, only.frame),
+        "ros": lambda: format_camera_info(twin, first, name),
+        "mrcal": lambda: format_mrcal(twin, only.frame),
+        "opencv": lambda: format_opencv(twin, only.frame),
+    }
+    save_bytes(path, formatted[to]())
+    lost = _lost(cameras, twins, to, only.frame)
     lenses, _, errors = zip(*found.values(), strict=True)
     return Conversion(Path(path), to, lost, lenses, errors)
 
@@ -298,7 +297,7 @@ def _why(model: CameraModel) -> str:
 def _lost(
     cameras: Mapping[str, CameraFile], twins: Mapping[str, CameraModel], to: str, frame: str
 ) -> tuple[str, ...]:
-    """What a format of other lenses cannot hold, a sentence each."""
+    """What a format cannot hold, a sentence each."""
     lost = []
     if to == "ros":
         for name, twin in twins.items():
@@ -311,6 +310,8 @@ def _lost(
             )
     elif to in ("mrcal", "kalibr"):
         lost.append(f"the pose is in the frame '{frame}', whose name is only a comment of the file")
+    elif to == "cahvor" and frame != UNKNOWN_FRAME:
+        lost.append(f"a .cahvor file cannot hold the name of the frame ('{frame}')")
     for key in ("fit", "provenance"):
         if any(getattr(camera, key) for camera in cameras.values()):
             lost.append(f"'{to}' cannot hold '{key}'")

@@ -9,7 +9,7 @@ twin.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -31,7 +31,6 @@ _COEFFICIENT_PX = 1e-3
 
 _BIT = 1e-6
 """A step of numeric derivatives."""
-
 
 LensFamily = Literal["pinhole", "equidistant"]
 FISHEYE: Kind = "OPENCV_FISHEYE"
@@ -147,45 +146,21 @@ def even_axes(model: CameraModel, z: FloatArray | None = None) -> FloatArray:
 def nearest_opencv(model: CameraModel, kind: Kind) -> CameraModel:
     """Return the camera of one of OpenCV's kinds, without skew, whose pixels come nearest to a model's.
 
-    Of 14 coefficients k1, k2, k3, p1, p2 and the turns of the plane are used. A plane turned about both axes
-    and a camera turned back leave an image that leans by the product of both turns. So OpenCV can hold H and
-    V that are not at right angles.
-
-    Raises ValueError if fewer than half of the image's pixels have a ray that such a lens can have; of 14
-    coefficients, if the entrance point moves.
+    Raises ValueError if fewer than half of the image's pixels have a ray that such a lens can have.
     """
     seen = _points_of(model)
     if (same := as_kind(model, kind)) is not None:
         return same
-    if kind == "OPENCV14" and model.moving:
-        raise ValueError("the entrance point moves")
-    found: list[tuple[float, CameraModel]] = []
-    for start in _starts(model, kind, seen):
-        camera = _fit(start, *seen, move=model.moving)
-        found.append((twin_error(model, camera, model.moving).worst_px, camera))
-        if found[-1][0] <= GOOD_PX:
-            break
-    return min(found, key=lambda one: one[0])[1]
-
-
-def _starts(model: CameraModel, kind: Kind, seen: tuple[FloatArray, FloatArray]) -> Iterator[CameraModel]:
-    """Yield where fits of a kind begin: as plain as can be, and where a shorter list of coefficients ended.
-
-    From the plain start a fraction's poles may come to lie in the image, and no step leads out again.
-    """
-    if kind != "OPENCV14":
-        yield _plain_start(model, kind)
-    if kind not in ("OPENCV8", "OPENCV12", "OPENCV14"):
-        return
+    found = _fit(_plain_start(model, kind), *seen, move=model.moving)
+    error = twin_error(model, found, model.moving)
+    if COEFFICIENTS[kind] < 8 or error.worst_px <= GOOD_PX:
+        return found
+    # From the plain start a fraction's poles may come to lie in the image, and no step leads out again.
     five = _fit(_plain_start(model, "OPENCV5"), *seen, move=model.moving)
-    h, v, a = model.H, model.V, model.A
-    # What a turned plane does to the lean grows as the square of its turn: from none no fit begins.
-    lean = abs(float(np.cross(h, a) @ np.cross(v, a))) / float(np.prod(model.focal_px))
-    turn = max(np.sqrt(lean), 1e-3)
-    for sign in (1.0, -1.0) if kind == "OPENCV14" else (0.0,):
-        numbers = np.pad(five.distortion, (0, COEFFICIENTS[kind] - 5))
-        numbers[12:] = [turn, sign * turn][: len(numbers) - 12]
-        yield CameraModel.of_matrix(kind, model.size_px, five.camera_matrix, numbers, five.rotation, five.C)
+    numbers = np.pad(five.distortion, (0, COEFFICIENTS[kind] - 5))
+    start = CameraModel.of_matrix(kind, model.size_px, five.camera_matrix, numbers, five.rotation, five.C)
+    other = _fit(start, *seen, move=model.moving)
+    return other if twin_error(model, other, model.moving).worst_px < error.worst_px else found
 
 
 def _plain_start(model: CameraModel, kind: Kind) -> CameraModel:
@@ -250,16 +225,15 @@ def _fit(
     """The camera of the kind of ``start`` whose pixels of the points come nearest; E stays what it is.
 
     Unknown are a turn, the camera matrix (its skew if wanted), the lens and, if it may move, C. The lens is
-    OpenCV's coefficients (of 14 k1 to k3, p1, p2 and the plane's turns), or O about A, R1, R2, a linearity.
+    OpenCV's coefficients, or O about A, R1, R2, a linearity.
     """
     from scipy.optimize import least_squares  # slow to load, and a daemon that starts does not need it
     from scipy.spatial.transform import Rotation
 
     rows = start.rotation if skew or start.kind in FREE else even_axes(start).T
     at = (0, 1, 0, 1, 0)[: 4 + skew], (0, 1, 2, 2, 1)[: 4 + skew]  # of the unknowns in the camera matrix
-    used = [0, 1, 2, 3, 4, 12, 13] if start.kind == "OPENCV14" else list(range(len(start.distortion)))
     ends = np.cumsum([3, 4 + skew, 3 * move])
-    lens = start.distortion[used]
+    lens = start.distortion
     if "O" in start.letters:
         o, general = rows @ start.O, [start.linearity] * (start.cahvore_type == 3)
         lens = np.array([*o[:2] / o[2], *start.R[1:], *general])
@@ -275,9 +249,8 @@ def _fit(
         if "O" in start.letters:
             o = axes.T @ [*lens[:2], 1.0]
             found |= {"O": o / np.linalg.norm(o), "R": np.array([start.R[0], *lens[2:4]])}
-        elif used:
-            found["D"] = np.zeros(len(start.distortion))
-            found["D"][used] = lens
+        elif len(lens):
+            found["D"] = lens
         return found
 
     def camera_of(unknowns: FloatArray) -> CameraModel:

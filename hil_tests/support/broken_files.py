@@ -185,7 +185,7 @@ def _use_model(camera: CameraFile) -> None:
         with tempfile.TemporaryDirectory() as folder:
             save_camera(camera, Path(folder) / "camera.yaml")
     else:
-        format_cahvor(camera)
+        format_cahvor(camera.model)
 
 
 def _use_rig(stored: StoredRig) -> None:

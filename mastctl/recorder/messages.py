@@ -16,7 +16,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from calib.files.twin import TwinError, even_axes, nearest_opencv, twin_error
+from calib.files.twin import TwinError, nearest_opencv, twin_error
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import Rigid, quaternion_of
@@ -111,7 +111,7 @@ def _carrier_from_optical(model: CameraModel) -> Rigid:
     try:
         return _nearest(model)[0].pose
     except ValueError:
-        return Rigid(even_axes(model), model.C)
+        return model.pose
 
 
 def _transform(parent: str, child: str, parent_from_child: Rigid, time_ns: int) -> FrameTransform:

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from calib.files.any_camera import nearest_lens
-from calib.files.twin import TwinError, even_axes
+from calib.files.twin import TwinError
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid
@@ -65,7 +65,7 @@ class KnownState:
         if camera in self.lenses:
             return self.lenses[camera][1].pose
         model = rig.cameras[camera].model
-        return Rigid(even_axes(model), model.C)
+        return model.pose
 
     @property
     def ends(self) -> int:

@@ -17,9 +17,7 @@ from calib.files.any_camera import load_any, save_any
 from calib.files.cahvor_text import (
     format_cahvor,
     internal_parameters,
-    parameter_order,
     parse_cahvor,
-    save_cahvor,
 )
 from calib.files.tables import parse_table, read_table, write_table
 from calib.geometry.cahvor import CameraModel
@@ -125,34 +123,14 @@ def test_a_cahv_file_needs_no_lens() -> None:
     assert parse_cahvor("\n".join(lines).encode(), "x").model.kind == "CAHV"
 
 
-def test_a_covariance_goes_through_text_and_yaml(tmp_path: Path) -> None:
-    rng = np.random.default_rng(3)
-    root = rng.normal(size=(18, 18))
-    covariance = 1e-8 * root @ root.T
-    camera = parse_cahvor(_jpl_text(covariance).encode(), "x.cahvor")
-    assert camera.fit["parameters"][:4] == ["C_x", "C_y", "C_z", "A_x"]
-    assert camera.fit["parameters"][15:] == ["R_0", "R_1", "R_2"]
-    np.testing.assert_allclose(camera.fit["covariance"], covariance, rtol=1e-9)
-    save_any(camera, tmp_path / "a.yaml")
-    loaded = load_any(tmp_path / "a.yaml")
-    assert isinstance(loaded, CameraFile)
-    done = save_any(loaded, tmp_path / "b.cahvor")
-    assert done.lost == ()
-    written = load_any(tmp_path / "b.cahvor")
-    assert isinstance(written, CameraFile) and written.fit["covariance"] == camera.fit["covariance"]
-
-
 def test_what_the_text_cannot_hold_is_said(tmp_path: Path) -> None:
     model = parse_cahvor(_jpl_text().encode(), "x").model
-    lost = save_cahvor(CameraFile(model, "rover", {"rms_px": 0.1}, {"by": "me"}), tmp_path / "a.cahvor")
-    assert [
-        word in sentence for word, sentence in zip(("frame", "fit", "provenance"), lost, strict=True)
-    ] == [
-        True,
-        True,
-        True,
-    ]
-    assert save_cahvor(CameraFile(model, "unknown"), tmp_path / "a.cahvor") == ()
+    done = save_any(CameraFile(model, "rover", {"rms_px": 0.1}, {"by": "me"}), tmp_path / "a.cahvor")
+    for part, sentence in zip(("frame", "fit", "provenance"), done.lost, strict=True):
+        assert part in sentence
+    assert save_any(CameraFile(model, "unknown"), tmp_path / "a.cahvor").lost == ()
+    camera = parse_cahvor(_jpl_text(np.eye(18)).encode(), "x")
+    assert camera.notes == ("line 14, 'S =', is not read",)
 
 
 class _JplScanner:
@@ -207,7 +185,7 @@ def test_flown_cameras_go_through_every_format_unchanged(reference_data: Path, t
 def test_jpls_reader_finds_every_value_in_what_is_written(reference_data: Path) -> None:
     for name, numbers in _vector_models(reference_data):
         model = _model_of(numbers)
-        text, _ = format_cahvor(CameraFile(model, "unknown"))
+        text = format_cahvor(model).decode()
         scanner = _JplScanner(text)
         if model.kind == "CAHVORE":
             scanner.scan("Model =")
@@ -283,16 +261,6 @@ def test_a_malformed_cahvor_file_is_refused_with_line_and_reason(case: str) -> N
     assert refused.value.place == place
     assert phrase in refused.value.reason
     assert "\n" not in str(refused.value)
-
-
-def test_a_covariance_that_is_none_is_refused() -> None:
-    matrix = np.eye(18)
-    matrix[3, 4] = 1.0
-    with pytest.raises(BadFile, match="not symmetric"):
-        parse_cahvor(_jpl_text(matrix).encode(), "x")
-    with pytest.raises(BadFile, match="18 rows of 18"):
-        parse_cahvor(_jpl_text(np.eye(17)).encode(), "x")
-    assert len(parameter_order("CAHVORE")) == 21
 
 
 def test_formats_are_known_by_content_whatever_the_name(tmp_path: Path) -> None:
