@@ -68,7 +68,7 @@ def parse_cahvor(data: bytes, path: str | Path) -> CameraFile:
 
 def format_cahvor(model: CameraModel) -> bytes:
     """Return the .cahvor text of a camera of the CAHV family."""
-    comma, name = "", model.kind
+    comma, name = "", str(model.kind)
     if model.kind == "CAHVORE":
         name = f"CAHVORE{model.cahvore_type}"
         comma = f",{_fixed(model.linearity)}" if model.cahvore_type == 3 else ""

@@ -103,13 +103,12 @@ def parse_mrcal(data: bytes, path: str | Path) -> CameraFile:
     name = record.lensmodel.replace("DISTORTION", "LENSMODEL", 1)
     if name in _OPENCV:
         numbers = _counted(source, record, 4 + _OPENCV[name])
-        lens, inner = ("intrinsics", "pinhole"), numbers[:4]
         return lens_camera(
             source,
-            lens,
-            numbers[4:],
+            ("intrinsics", "pinhole"),
+            numbers[4:].tolist(),
             record.imagersize,
-            inner,
+            numbers[:4],
             frame_from_camera,
             UNKNOWN_FRAME,
             digest_of(data),
