@@ -8,8 +8,6 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 
 def as_json(value: Any) -> Any:
     """Return dataclasses, arrays and tuples as plain JSON values; numbers that are not finite become null."""
@@ -17,12 +15,10 @@ def as_json(value: Any) -> Any:
         return {field.name: as_json(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
         return {readable(str(key)): as_json(entry) for key, entry in value.items()}
-    if isinstance(value, np.ndarray):
+    if type(value).__module__ == "numpy":  # an array or a scalar; NumPy is not loaded for that
         return as_json(value.tolist())
     if isinstance(value, (list, tuple, set, frozenset)):
         return [as_json(entry) for entry in value]
-    if isinstance(value, np.generic):
-        return as_json(value.item())
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if value is None or isinstance(value, (int, bool)):

@@ -38,7 +38,7 @@ from mastctl.http.tokens import TokenList
 from mastctl.http.waiting import Streams, Waiting
 from mastctl.logs import stall_while
 from mastctl.safety.state_folder import StateFolder
-from mastctl.safety.stop_threads import StopsHang
+from mastctl.safety.stop_socket import StopsHang
 from mastctl.service.service import Service
 from mastctl.service_manager import Heartbeat, ServiceManager
 from mastctl.web.app import create_app

@@ -28,7 +28,7 @@ from mastctl.config import load_config
 from mastctl.control import operations as operations_module
 from mastctl.daemon import AddressInUse, RunningDaemon, _suspend
 from mastctl.devices import devices as devices_module
-from mastctl.safety.stop_threads import StopThreads
+from mastctl.safety.stop_socket import StopThreads
 from mastctl.service import service as service_module
 
 

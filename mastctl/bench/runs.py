@@ -26,7 +26,7 @@ from calib.targets.boards import AnyBoard
 from mastctl.answers import BenchRunRecord, BenchSummary
 from mastctl.errors import BadRequest, NotKnown, Unable
 from mastctl.packaged import config_folder
-from mastctl.safety.state_file import StateFile
+from mastctl.safety.state_folder import StateFile
 
 NAME = re.compile(r"[0-9]{8}-[0-9]{6}(-[0-9]{1,3})?")
 SCHEMA = "mastctl/bench_run/1"

@@ -89,15 +89,15 @@ def _by_any_path(
     args: argparse.Namespace, line: str, request: Callable[[Client], Mapping[str, Any]]
 ) -> Mapping[str, Any]:
     """Stop by the stop socket where there is one, else over HTTP; ``reached``: the socket or address."""
-    from mastctl.safety.stop_line import NoAnswer
-    from mastctl.safety.stop_line import request as ask_socket
+    from mastctl.safety.stop_socket import NoAnswer
+    from mastctl.safety.stop_socket import request as request_stop
 
     answer: Mapping[str, Any] | None = None
     failed = ""
     for paths in _sockets(args):
         for path in paths:
             try:
-                answer = {**ask_socket(path, line), "reached": str(path)}
+                answer = {**request_stop(path, line), "reached": str(path)}
             except NoAnswer:
                 continue
             except ValueError as error:
@@ -122,17 +122,21 @@ def _by_any_path(
 
 def _sockets(args: argparse.Namespace) -> Iterator[list[Path]]:
     """The stop sockets of the daemon that is meant; the next ones if the ones before do not answer."""
-    from calib.errors import BadFile
-    from mastctl.config import load_config, load_head
     from mastctl.packaged import default_config
-    from mastctl.safety.state_folder import usual_folder
-    from mastctl.safety.stop_line import sockets_of
+    from mastctl.safety.state_folder import head_folders, usual_folder
+    from mastctl.safety.stop_socket import sockets_of
 
     url = args.url or os.environ.get("MASTCTL_URL")
     if url is not None:
         yield sockets_of(None, None if args.config is None else Path(args.config), url)
         return
     config = default_config() if args.config is None else Path(args.config)
+    known = sockets_of(None, config, None)
+    if len(known) == 1:  # found without reading the configuration, which takes longer than the stop
+        yield known
+    from calib.errors import BadFile
+    from mastctl.config import load_config, load_head
+
     with contextlib.suppress(BadFile):
         loaded = load_config(config)
         if loaded.state_folder is not None:
@@ -140,11 +144,10 @@ def _sockets(args: argparse.Namespace) -> Iterator[list[Path]]:
         else:
             yield sockets_of(None, config, loaded.listen.url)
             yield sockets_of(usual_folder(config, loaded.listen.url), None, None)
-    from drivers.hardware import head_name  # only without an answer so far: a stop is quick
-    from mastctl.safety.heads import head_folders
+    from drivers.hardware import head_name
 
     with contextlib.suppress(BadFile):  # a daemon of this head by another configuration
         name = head_name(load_head(config))
         for folder in [] if name is None else head_folders(name):
             yield sockets_of(folder, None, None)
-    yield sockets_of(None, config, None)  # or this configuration, by --listen
+    yield known  # or this configuration, by --listen

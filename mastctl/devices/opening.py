@@ -1,7 +1,7 @@
 """Opening a head: nothing else in this program does (checked by the import contracts).
 
-The program that opens one locks its place (`mastctl.safety.heads`), so that no other program drives it; knows
-its latch; and moves it within limits, around keep-outs and off the sun, as `mastctl.devices.judge` judges.
+The program that opens one locks its folder (`mastctl.safety.state_folder`), so that no other program drives
+it; knows its latch; and moves it within limits, around keep-outs and off the sun (`mastctl.devices.judge`).
 """
 
 from __future__ import annotations
@@ -27,9 +27,8 @@ from mastctl.devices.devices import HEAD, Devices
 from mastctl.devices.judge import KeepOutJudge
 from mastctl.devices.limits import Limits, SunDirection
 from mastctl.errors import Stopped
-from mastctl.safety import heads
 from mastctl.safety.latch import Estopped, latched_at
-from mastctl.safety.state_folder import StateFolder
+from mastctl.safety.state_folder import StateFolder, other_head_folders, take_head
 
 STILL = "this program moves no head"
 
@@ -57,7 +56,8 @@ def open_rig(settings: HardwareSettings, clock: Clock) -> tuple[Hardware, StateF
     `drivers.open_hardware.open_hardware`.
     """
     with ExitStack() as undo:
-        place = heads.of_settings(settings)
+        name = head_name(settings)
+        place = None if name is None else take_head(name)
         if place is not None:
             undo.callback(place.close)
         hardware = open_hardware(settings, clock)
@@ -200,7 +200,7 @@ def _alone(settings: HardwareSettings, moves: bool, state: Path | None) -> Itera
 
 @contextmanager
 def _locked(name: str, *, moves: bool, state: Path | None = None) -> Iterator[None]:
-    place = heads.take(name)
+    place = take_head(name)
     try:
         if moves:
             _check_latch(name, place, state)
@@ -213,6 +213,6 @@ def _locked(name: str, *, moves: bool, state: Path | None = None) -> Iterator[No
 def _check_latch(name: str, place: StateFolder | None, state: Path | None) -> None:
     """Pass a head whose emergency stop is not latched. Raises Estopped."""
     folders = [folder for folder in (None if place is None else place.path, state) if folder is not None]
-    entries = latched_at(folders, heads.others(name, place))
+    entries = latched_at(folders, other_head_folders(name, place))
     if entries:
         raise Estopped(f"{latched_sentence(entries)} at the head's daemon; until then nothing moves the head")

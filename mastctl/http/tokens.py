@@ -25,7 +25,7 @@ from calib.files.records import Record, read_value
 from mastctl.answers import Role
 from mastctl.control.caller import ROLES
 from mastctl.errors import MastctlError
-from mastctl.safety.state_file import StateFile
+from mastctl.safety.state_folder import StateFile
 
 TOKEN_BYTES = 32
 LIST_NAME = "tokens.json"

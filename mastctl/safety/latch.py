@@ -1,7 +1,7 @@
 """The latch of a head: in memory from the first moment, and on the disk across restarts.
 
-It is kept in the head's place (`mastctl.safety.heads`), or in the state folder for a head in this program's
-memory. It keeps a log of its causes, and a reset releases all of them.
+It is kept in the head's folder (`mastctl.safety.state_folder`), or in the state folder for a head in this
+program's memory. It keeps a log of its causes, and a reset releases all of them.
 
 A file that cannot be read means latched: so a stop is written over the file of a released latch, which is
 there from the start, and quick. The disk never holds the stop up: a thread of its own writes, after the head
@@ -11,6 +11,7 @@ was stopped, and tries again for as long as the disk refuses.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import threading
 import time
@@ -23,8 +24,7 @@ from typing import Any
 from calib.errors import BadFile
 from mastctl.control.standing import Latched, latched_sentence
 from mastctl.errors import NotNow, Stopped, Unable, one_line
-from mastctl.safety.state_file import StateFile
-from mastctl.safety.state_folder import StateFolder
+from mastctl.safety.state_folder import StateFile, StateFolder
 
 log = logging.getLogger(__name__)
 
@@ -63,13 +63,11 @@ class Latch:
     def __init__(
         self, folder: StateFolder, state: StateFolder | None = None, others: Sequence[Path] = ()
     ) -> None:
-        self.folder = self._folder = folder
+        self.folder = folder
         self._file = _file_in(folder.path)
-        self._marks = [StateFile(folder.path / USED, USED_SCHEMA)]
-        if state is not None:
-            self._marks.append(StateFile(state.path / USED, USED_SCHEMA))
-            others = (*others, state.path)
-        self._others = [_file_in(other) for other in others]
+        places = [folder.path] if state is None else [folder.path, state.path]
+        self._marks = _marks_in(places)
+        self._others = [_file_in(other) for other in (*others, *places[1:])]
         self._changed = threading.Condition()
         self._disk = threading.Lock()  # for writers; a disk that hangs holds no other thread
         self.entries: tuple[Latched, ...] = ()
@@ -80,20 +78,15 @@ class Latch:
         self._due_s = 0.0  # when the disk may be written to
         self._ended = False
         found = _entries(self._file)
-        if found is None:
-            self.entries = _gone(self._file, self._marks)
-        else:
-            self.entries = self._kept = found
-        for file in self._others:
-            self.entries = _merged(self.entries, _entries(file) or ())
-        if not self.entries or self.entries == self._kept:
-            self._kept = self.entries
+        self.entries = _gone(self._file, self._marks) if found is None else found
+        self.entries = _merged(self.entries, *(_entries(other) or () for other in self._others))
+        self._kept = self.entries if self.entries == (found or ()) else found
         self._on_disk = bool(self.entries)  # whether a restart may find one, this one or another
         if self.entries:
             log.warning("%s", latched_sentence(self.entries))
         threading.Thread(target=self._keep, name="latch", daemon=True).start()
 
-    def hold(self, reason: str | None, name: str | None) -> Latched:
+    def add(self, reason: str | None, name: str | None) -> Latched:
         """Latch in memory, at once; return the cause. The log keeps each once, and the first `MOST`.
 
         The disk is written to when `head_stopped` is called, or a moment later.
@@ -145,15 +138,15 @@ class Latch:
     @property
     def survives(self) -> bool:
         """Whether a restart would find what is latched."""
-        return self._kept is self.entries and not self._folder.is_temporary
+        return self._kept is self.entries and not self.folder.is_temporary
 
     @property
     def not_kept(self) -> str:
         """Why an emergency stop is not kept, one sentence; empty if it is, or none is latched."""
         if not self.entries or self.survives:
             return ""
-        if self._folder.is_temporary:
-            return self._folder.why_temporary or "this daemon keeps its state in a temporary folder"
+        if self.folder.is_temporary:
+            return self.folder.why_temporary or "this daemon keeps its state in a temporary folder"
         return self._problem or "the disk has not confirmed it yet"
 
     def release(self, reason: str, name: str) -> tuple[Latched, ...]:
@@ -229,7 +222,7 @@ class Latch:
     def _keep(self) -> None:
         """Write what is latched, in a thread of its own."""
         with self._disk:
-            if not self.entries and not self._folder.is_temporary and not self._file.has_room:
+            if not self.entries and not self.folder.is_temporary and not self._file.has_room:
                 with contextlib.suppress(BadFile):  # then a stop is written anew, and reports the fault
                     self._file.write({"latched": False})
             self._mark()
@@ -254,7 +247,7 @@ class Latch:
 
     def _mark(self) -> None:
         """Remember that the file is there, once it is."""
-        if self._folder.is_temporary or not self._file.path.exists():
+        if self.folder.is_temporary or not self._file.path.exists():
             return
         for mark in self._marks:
             with contextlib.suppress(BadFile):
@@ -297,11 +290,12 @@ def latched_at(folders: Sequence[Path], others: Sequence[Path]) -> tuple[Latched
     if folders:
         file = _file_in(folders[0])
         found = _entries(file)
-        marks = [StateFile(folder / USED, USED_SCHEMA) for folder in folders]
-        entries = _gone(file, marks) if found is None else found
-    for other in (*others, *folders[1:]):
-        entries = _merged(entries, _entries(_file_in(other)) or ())
-    return entries
+        entries = _gone(file, _marks_in(folders)) if found is None else found
+    return _merged(entries, *(_entries(_file_in(other)) or () for other in (*others, *folders[1:])))
+
+
+def _marks_in(folders: Sequence[Path]) -> list[StateFile]:
+    return [StateFile(folder / USED, USED_SCHEMA) for folder in folders]
 
 
 def _file_in(folder: Path) -> StateFile:
@@ -351,9 +345,9 @@ def _document(entries: tuple[Latched, ...]) -> dict[str, Any]:
     return {"latched": True, **asdict(first)} | ({"more": [asdict(one) for one in more]} if more else {})
 
 
-def _merged(entries: tuple[Latched, ...], more: tuple[Latched, ...]) -> tuple[Latched, ...]:
+def _merged(entries: tuple[Latched, ...], *more: tuple[Latched, ...]) -> tuple[Latched, ...]:
     """Causes with further ones, `MOST` at most; the same tuple if there are none."""
-    for one in more:
+    for one in itertools.chain(*more):
         if len(entries) < MOST and not any(_same(one, other) for other in entries):
             entries = (*entries, one)
     return entries

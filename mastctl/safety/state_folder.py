@@ -1,9 +1,16 @@
-"""The folder in which a daemon keeps its state: where it is, and that no second daemon uses it.
+"""Folders in which a daemon keeps what must outlive it, each for one program at a time; and their files.
 
-In this order: ``state.folder`` of the configuration; ``$STATE_DIRECTORY`` (systemd); a folder of the
-configuration and address under ``$XDG_STATE_HOME`` or ``~/.local/state``. A daemon at any free port, and one
-inside another program, keeps its state in a temporary folder that goes with it, if the first two name none.
-The latch of a head that others can reach has a place of its own: `mastctl.safety.heads`.
+The state folder is, in this order: ``state.folder`` of the configuration; ``$STATE_DIRECTORY`` (systemd); a
+folder of the configuration and address under ``$XDG_STATE_HOME`` or ``~/.local/state``. A daemon at any free
+port, and one inside another program, keeps its state in a temporary folder that goes with it, if the first
+two name none.
+
+The latch of a head that others can reach has a folder of its own, by what the head is, not by the program
+that drives it. A head has a name (`drivers.hardware.head_name`); the folder of that name is in
+``/var/lib/mastctl/heads``, where ``/var/lib/mastctl`` exists (the systemd unit makes it) and this user may
+write; else in ``.local/state/mastctl/heads`` of the user's home as the password database has it. No variable
+of the environment moves it. Only a simulator's line (a pseudo terminal, loopback) and a driver from outside
+without a ``port`` follow ``$MASTCTL_HEADS``, so that tests share nothing.
 """
 
 from __future__ import annotations
@@ -11,22 +18,33 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
+import json
 import logging
 import os
+import pwd
+import re
 import shutil
 import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from glob import escape
 from pathlib import Path
+from typing import Any
 
 from calib.errors import BadFile
 from mastctl.errors import MastctlError
-from mastctl.safety.state_file import StateFile
 
 log = logging.getLogger(__name__)
 
 NAME = "mastctl"
 DAEMON_FILE = "daemon.json"
 DAEMON_SCHEMA = "mastctl/daemon/1"
+MAX_BYTES = 1 << 20
+SYSTEM = Path("/var/lib/mastctl")
+VARIABLE = "MASTCTL_HEADS"
+READABLE = 0o755  # another user who opens the same line has to find the latch
+_SIMULATED = re.compile(r"pts-|127\.|\[?::1\]?(?::|$)|[\w.:-]+ \{")
+_PTS = re.compile(r"pts-\d+-")
 
 
 class StateInUse(MastctlError):
@@ -35,17 +53,102 @@ class StateInUse(MastctlError):
     code = "state_in_use"
 
 
-class StateFolder:
-    """A folder that is this daemon's alone until it is closed; `of` and `temporary` make one.
+@dataclass(frozen=True)
+class StateFile:
+    """One JSON document, of which a crash during `write` leaves the old or the new, whole.
 
-    Attributes
-    ----------
-    is_temporary
-        Whether it goes when it is closed.
-    why_temporary
-        Why what is kept there is lost with this daemon, though that was not wanted; empty otherwise.
-    refused
-        Why the disk refused what was to be written at the start; empty if it did not.
+    ``schema`` is its kind and version; a file with another one is refused. ``room`` is how long the file is
+    at least, bytes, filled up with blanks: what `overwrite` may need.
+    """
+
+    path: Path
+    schema: str
+    room: int = 0
+    mode: int = 0o600
+
+    def read(self) -> dict[str, Any] | None:
+        """Return the document without its schema; None without a file.
+
+        Raises BadFile if the file cannot be read, or is something else.
+        """
+        from calib.files import open_plain  # loads NumPy, which a stop from another process has no time for
+
+        try:
+            with open_plain(self.path) as file:
+                data = file.read(MAX_BYTES + 1)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise BadFile(self.path, "", f"cannot be read: {error.strerror or error}") from None
+        if len(data) > MAX_BYTES:
+            raise BadFile(self.path, "", f"is larger than {MAX_BYTES} bytes")
+        try:
+            document = json.loads(data)
+        except (ValueError, RecursionError):
+            message = f"is no JSON (its {len(data)} bytes are not what was written)"
+            raise BadFile(self.path, "", message) from None
+        if not isinstance(document, dict):
+            raise BadFile(self.path, "", f"holds no JSON object where one of {self.schema} is expected")
+        found = document.pop("schema", None)
+        if found != self.schema:
+            raise BadFile(self.path, "schema", f"{found!r} where '{self.schema}' is expected")
+        return document
+
+    def write(self, document: Mapping[str, Any]) -> None:
+        """Put a document in the place of the former one; when this returns it is on the disk.
+
+        Raises BadFile if the file system refuses; what is then read is the former document, or the new one if
+        only its way to the disk was not confirmed.
+        """
+        from calib.files.atomic import replace_bytes
+
+        with self._refused("saved"):
+            replace_bytes(self.path, self._data(document).ljust(self.room), self.mode)
+
+    def overwrite(self, document: Mapping[str, Any]) -> None:
+        """Write a document over the former one, as quickly as can be; when this returns it is on the disk.
+
+        A crash meanwhile may leave a file that cannot be read: only for what then counts as this document.
+        Raises as `write`, and BadFile if there is no file with room for it.
+        """
+        from calib.files.atomic import overwrite_bytes
+
+        with self._refused("overwritten"):
+            overwrite_bytes(self.path, self._data(document))
+
+    def remove(self) -> None:
+        """Remove the file; when this returns it is gone from the disk too. Raises BadFile."""
+        from calib.files.atomic import remove
+
+        with self._refused("removed"):
+            remove(self.path)
+
+    @property
+    def has_room(self) -> bool:
+        """Whether there is a file that can be written over."""
+        try:
+            return self.path.stat().st_size >= self.room
+        except OSError:
+            return False
+
+    def _data(self, document: Mapping[str, Any]) -> bytes:
+        text = json.dumps({"schema": self.schema, **document}, indent=1, allow_nan=False)
+        return f"{text}\n".encode()
+
+    @contextlib.contextmanager
+    def _refused(self, done: str) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise BadFile(self.path, "", f"cannot be {done}: {error.strerror or error}") from None
+
+
+class StateFolder:
+    """A folder that is this program's alone until it is closed; `of`, `temporary` and `take_head` make one.
+
+    ``is_temporary``: it goes when it is closed; ``why_temporary``: why what is kept there is lost with this
+    daemon, though that was not wanted; ``refused``: why the disk refused what was to be written at the start;
+    both empty otherwise.
     """
 
     def __init__(
@@ -78,11 +181,11 @@ class StateFolder:
 
     @classmethod
     def of(cls, named: Path | None, config: Path, address: str) -> StateFolder:
-        """Take the folder of a configuration, and make it if it is not there.
+        """Take the folder of a configuration and an address, and make it if it does not exist.
 
         A usual place that cannot be made is replaced by a temporary one, since nothing can be kept there; one
-        that was ``named`` (``state.folder``) is insisted upon, since something may. The configuration's file
-        and the daemon's address make the name of the usual place. Raises BadFile, StateInUse.
+        that was ``named`` (``state.folder``) is insisted upon, since something may. Raises BadFile,
+        StateInUse.
         """
         found = cls.named(named)
         if found is not None:
@@ -105,14 +208,10 @@ class StateFolder:
 
     def note_daemon(self, config: Path, url: str, stop_socket: Path | None) -> None:
         """Write which daemon uses this folder, for commands that find it; `refused` has a disk's refusal."""
-        content = {
-            "pid": os.getpid(),
-            "url": url,
-            "config": str(config.resolve()),
-            "stop_socket": str(stop_socket),
-        }
+        content = {"pid": os.getpid(), "url": url, "config": str(config.resolve())}
         try:
-            StateFile(self.path / DAEMON_FILE, DAEMON_SCHEMA).write(content)
+            note = StateFile(self.path / DAEMON_FILE, DAEMON_SCHEMA)
+            note.write({**content, "stop_socket": str(stop_socket)})
         except BadFile as error:
             self.refused = str(error)
             log.error("the state folder cannot be written: %s", error)
@@ -131,16 +230,10 @@ class StateFolder:
             os.close(lock)
 
 
-def state_home() -> Path:
-    """Return the folder that holds the usual places of all daemons of this user."""
-    home = Path(os.environ.get("XDG_STATE_HOME", ""))
-    return (home if home.is_absolute() else Path.home() / ".local" / "state") / NAME
-
-
 def usual_folder(config: Path, address: str) -> Path:
     """Return the usual place of a daemon: the configuration's name, and digits of its path and address."""
-    digest = hashlib.sha256(os.fsencode(f"{config.resolve()}\n{address}")).hexdigest()[:8]
-    return state_home() / f"{config.stem}-{digest}"
+    digits = _digits(os.fsencode(f"{config.resolve()}\n{address}"))
+    return _state_home() / f"{config.stem}-{digits}"
 
 
 def folder_of(named: Path | None, config: Path, address: str) -> Path | None:
@@ -151,15 +244,95 @@ def folder_of(named: Path | None, config: Path, address: str) -> Path | None:
 
 
 def folders_of(config: Path | None) -> list[Path]:
-    """Return the places in which a daemon's state may be, of one configuration or of any, as far as known.
+    """Return the folders in which a daemon's state may be, of one configuration or of any, as far as known.
 
-    Only what is there; for a program that cannot read the configuration.
+    Only those that exist, those of all heads too; for a program that cannot, or need not, read the
+    configuration.
     """
     found = [path for path in [_of_systemd()] if path is not None and path.is_dir()]
     stem = "*" if config is None else escape(config.stem)
     with contextlib.suppress(OSError, RuntimeError):
-        found += sorted(path for path in state_home().glob(f"{stem}-????????") if path.is_dir())
+        found += sorted(path for path in _state_home().glob(f"{stem}-????????") if path.is_dir())
+    for parent in _heads_parents():
+        with contextlib.suppress(OSError):
+            found += sorted(path for path in parent.iterdir() if path.is_dir())
     return found
+
+
+def head_folders(name: str) -> list[Path]:
+    """Return the folders in which a head's latch may lie, the one that is preferred first."""
+    folder = f"{re.sub(r'[^A-Za-z0-9._-]', '_', name)[:80]}-{_digits(name.encode())}"
+    given = os.environ.get(VARIABLE, "")
+    if given and _SIMULATED.match(name):
+        return [Path(given) / folder]
+    return [parent / folder for parent in _heads_parents()]
+
+
+def take_head(name: str) -> StateFolder | None:
+    """Take a head's folder for this program alone; None where none can be made.
+
+    Raises StateInUse if another program drives this head.
+    """
+    refused = ""
+    for folder in head_folders(name):
+        try:
+            for path in (folder.parent, folder):
+                with contextlib.suppress(FileExistsError):
+                    path.mkdir(parents=True)
+                    path.chmod(READABLE)  # whatever the umask
+        except OSError as error:
+            refused = refused or f"{folder}: {error.strerror or error}"
+            continue
+        if os.access(folder, os.W_OK):
+            _clear_beside(folder)
+            return StateFolder(folder, of_head=name)
+    log.warning("the latch of the head at %s stays in the state folder alone: %s", name, refused)
+    return None
+
+
+def other_head_folders(name: str | None, taken: StateFolder | None) -> Sequence[Path]:
+    """Return a head's folders beside the one that was taken: what is latched in those counts too."""
+    if name is None:
+        return ()
+    return [folder for folder in head_folders(name) if taken is None or folder != taken.path]
+
+
+def _heads_parents() -> list[Path]:
+    found = [SYSTEM / "heads"] if _exists(SYSTEM) else []
+    with contextlib.suppress(KeyError):  # a user whom the password database does not know
+        found.append(_home() / ".local" / "state" / NAME / "heads")
+    return found
+
+
+def _clear_beside(folder: Path) -> None:
+    """Remove the folders of pseudo terminals that had this one's number before: they are closed for good."""
+    found = _PTS.match(folder.name)
+    if found is not None:
+        for other in folder.parent.glob(f"{found.group()}*"):
+            if other != folder:
+                shutil.rmtree(other, ignore_errors=True)
+
+
+def _state_home() -> Path:
+    """The folder that holds the usual places of all daemons of this user."""
+    home = Path(os.environ.get("XDG_STATE_HOME", ""))
+    return (home if home.is_absolute() else Path.home() / ".local" / "state") / NAME
+
+
+def _home() -> Path:
+    """This user's home, whatever ``$HOME`` says. Raises KeyError."""
+    return Path(pwd.getpwuid(os.getuid()).pw_dir)
+
+
+def _digits(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()[:8]
+
+
+def _exists(folder: Path) -> bool:
+    try:
+        return folder.is_dir()
+    except OSError:  # what cannot be read may hold a latch
+        return True
 
 
 def _of_systemd() -> Path | None:

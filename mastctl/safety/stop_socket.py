@@ -1,8 +1,11 @@
-"""A Unix socket that takes stops and nothing else, beside the web side and independent of it.
+"""How stops come in: by threads for the web side, and by a Unix socket that takes nothing else.
 
-A client sends one line, ``stop`` or ``estop NAME: REASON``, and gets one line: what was done, or why it
-failed. Each connection has a thread of its own, so a silent one delays no other and no event loop is needed.
-Some descriptors are kept for it, so that it answers when the process has none left.
+The socket is independent of the web side. A client sends one line, ``stop`` or ``estop NAME: REASON``, and
+gets one line: what was done, or why it failed. Each connection has a thread of its own, so a silent one
+delays no other and no event loop is needed. Some descriptors are kept for it, so that it answers when the
+process has none left.
+
+`request` sends such a line from another process; it needs no configuration that can be read.
 """
 
 from __future__ import annotations
@@ -16,20 +19,94 @@ import socket
 import socketserver
 import threading
 import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, Protocol
+from queue import SimpleQueue
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from mastctl.answers import EstopTold, StopTold
-from mastctl.errors import MastctlError, error_body
+from drivers.clock import Clock, SystemClock
+from mastctl.errors import MastctlError, Unable, error_body
+from mastctl.safety.state_folder import DAEMON_FILE, DAEMON_SCHEMA, folders_of
+
+if TYPE_CHECKING:
+    from mastctl.answers import EstopTold, StopTold
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T")
+
+THREADS = 4
+OVERDUE_S = 1.5  # a stop is given 1 s by the devices
 FILE = "stop.sock"
 LONGEST_PATH = 100  # bytes; the kernel's own bound is 108
 LONGEST_LINE = 1024
 SPARES = 8
 SILENT_S = 5.0
 POLL_S = 0.1  # how late the end is noticed
+ANSWER_S = 5.0
+
+
+class StopsHang(Unable):
+    """As many stops as there are threads have not come back; another one could not be sent."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__("stop_pending", message)
+
+
+class StopThreads:
+    """Daemon threads that exist from the start and run stops alone; safe to use from any thread.
+
+    They wait for calls, never for ``clock``, by which a call is known to be overdue.
+    """
+
+    def __init__(self, threads: int = THREADS, clock: Clock | None = None) -> None:
+        self._threads = threads
+        self._clock = clock or SystemClock()
+        self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._began_s: dict[object, float] = {}  # of the calls under way
+        for number in range(threads):
+            threading.Thread(target=self._work, name=f"stop_{number}", daemon=True).start()
+
+    def submit(self, function: Callable[[], T]) -> Future[T]:
+        """Run a function in the next free thread and return its future result; returns at once.
+
+        Raises StopsHang if every thread has been in its call for longer than a stop may take.
+        """
+        now_s = self._clock.now_s()
+        under_way_s = [now_s - began_s for began_s in self._began_s.copy().values()]
+        if len(under_way_s) >= self._threads and min(under_way_s) > OVERDUE_S:
+            raise StopsHang(
+                f"{len(under_way_s)} stops are under way, the oldest for {max(under_way_s):.1f} s, and none "
+                "has come back; the head may still move: switch its power off"
+            )
+        future: Future[T] = Future()
+        future.set_running_or_notify_cancel()  # a caller that waits no longer does not cancel the stop
+
+        def call() -> None:
+            self._began_s[future] = self._clock.now_s()
+            result, failure = None, None
+            try:
+                result = function()
+            except BaseException as error:  # it belongs to the caller
+                failure = error
+            self._began_s.pop(future)
+            if failure is None:
+                future.set_result(result)  # type: ignore[arg-type]
+            else:
+                future.set_exception(failure)
+
+        self._calls.put(call)
+        return future
+
+    def close(self) -> None:
+        """Let the threads end after what is under way; does not wait."""
+        for _ in range(self._threads):
+            self._calls.put(None)
+
+    def _work(self) -> None:
+        while (call := self._calls.get()) is not None:
+            call()
 
 
 class StopHandlers(Protocol):
@@ -39,39 +116,23 @@ class StopHandlers(Protocol):
     def estop(self, reason: str | None, name: str | None) -> EstopTold: ...
 
 
-class StopSocket:
+class StopSocket(socketserver.ThreadingUnixStreamServer):
     """Listens at a path from its construction on, until `close`. Raises MastctlError if it cannot.
 
     A socket that a dead daemon has left at the path is replaced. Only this user may connect.
     """
 
-    def __init__(self, path: Path, stops: StopHandlers) -> None:
-        self.path = path
-        self._server = _Server(path, stops)
-        threading.Thread(
-            target=self._server.serve_forever, args=(POLL_S,), name="stop socket", daemon=True
-        ).start()
-
-    def close(self) -> None:
-        """Take no more; what is under way is answered."""
-        with contextlib.suppress(OSError):
-            self.path.unlink(missing_ok=True)
-        self._server.shutdown()
-        self._server.server_close()
-
-
-class _Server(socketserver.ThreadingUnixStreamServer):
     daemon_threads = True
     block_on_close = False
     request_queue_size = 4096
 
     def __init__(self, path: Path, stops: StopHandlers) -> None:
+        self.path = path
         self.stops = stops
         self._spares: list[int] = []
         if len(os.fsencode(path)) > LONGEST_PATH:
-            raise MastctlError(
-                f"{path} is longer than the {LONGEST_PATH} bytes that a socket's path may have"
-            )
+            message = f"{path} is longer than the {LONGEST_PATH} bytes that a socket's path may have"
+            raise MastctlError(message)
         super().__init__(str(path), _Connection, bind_and_activate=False)
         try:
             path.unlink(missing_ok=True)  # the folder is this daemon's alone
@@ -82,6 +143,16 @@ class _Server(socketserver.ThreadingUnixStreamServer):
             self.server_close()
             raise MastctlError(f"{path}: cannot listen for stops there: {error.strerror or error}") from None
         self._keep_spares()
+        threading.Thread(target=self.serve_forever, args=(POLL_S,), name="stop socket", daemon=True).start()
+
+    def close(self) -> None:
+        """Take no more; what is under way is answered."""
+        with contextlib.suppress(OSError):
+            self.path.unlink(missing_ok=True)
+        self.shutdown()
+        self.server_close()
+        while self._spares:
+            os.close(self._spares.pop())
 
     def get_request(self) -> tuple[socket.socket, Any]:
         """Accept a connection, with a descriptor of those that are kept if there is no other."""
@@ -111,12 +182,6 @@ class _Server(socketserver.ThreadingUnixStreamServer):
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Log a defect, and go on."""
         log.exception("the stop socket met a defect of the program")
-
-    def server_close(self) -> None:
-        """Close the socket and give the kept descriptors back."""
-        super().server_close()
-        while self._spares:
-            os.close(self._spares.pop())
 
     def _keep_spares(self) -> None:
         with contextlib.suppress(OSError):
@@ -153,3 +218,98 @@ class _Connection(socketserver.StreamRequestHandler):
         except Exception as error:
             return f"failed: {error_body(error)['message']}"
         return f"{verb} {json.dumps(answer, ensure_ascii=True)}"
+
+
+# From another process
+
+
+class NoAnswer(Exception):
+    """No program listens there, or none that answers as a daemon does."""
+
+
+def sockets_of(folder: Path | None, config: Path | None, url: str | None) -> list[Path]:
+    """Return the stop sockets of a daemon, whether a program listens there or not.
+
+    ``folder`` is its state folder, ``config`` its configuration, which may be broken, ``url`` its address;
+    None where that is not known.
+    """
+    if folder is not None:
+        return [path for path, _ in _of(folder)]
+    found = dict[Path, None]()  # a daemon is noted in its head's folder too
+    for place in folders_of(config):
+        for path, noted in _of(place):
+            wrong = noted and (
+                (config is not None and noted.get("config") != str(config.resolve()))
+                or (url is not None and noted.get("url") != url)
+            )
+            if not wrong and (noted or url is None):
+                found[path] = None
+    return list(found)
+
+
+def request(path: Path, line: str) -> dict[str, Any]:
+    """Send one line; return the daemon's answer.
+
+    Raises NoAnswer if no program listens, or none that answers as a daemon does; ValueError: with the
+    daemon's own sentence, if it could not.
+    """
+    verb, _, rest = _answer(path, line).partition(" ")
+    if verb == "failed:":
+        raise ValueError(rest)
+    try:
+        answer = json.loads(rest)
+    except (ValueError, RecursionError):
+        answer = None
+    if not isinstance(answer, dict) or verb != line.split()[0]:
+        raise NoAnswer(f"the program that listens at {path} does not answer as a daemon does")
+    return answer
+
+
+def _answer(path: Path, line: str) -> str:
+    """One line of answer; empty if the other side has closed without one."""
+    until_s = time.monotonic() + ANSWER_S
+    answer = b""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as peer:
+        peer.settimeout(ANSWER_S)
+        try:
+            _connect(peer, path, until_s)
+            peer.sendall(f"{line}\n".encode())
+            while not answer.endswith(b"\n"):
+                peer.settimeout(max(0.01, until_s - time.monotonic()))
+                part = peer.recv(4096)
+                if not part:
+                    break
+                answer += part
+        except TimeoutError:
+            raise NoAnswer(
+                f"{path} took the line but did not answer within {ANSWER_S:g} s; the head may still move"
+            ) from None
+        except (ConnectionResetError, BrokenPipeError):
+            return ""
+        except OSError as error:
+            raise NoAnswer(f"no daemon listens at {path}: {error.strerror or error}") from None
+    return answer.decode("utf-8", "replace").strip()
+
+
+def _connect(peer: socket.socket, path: Path, until_s: float) -> None:
+    """Connect, after other waiting clients. Raises OSError."""
+    while True:
+        try:
+            peer.connect(str(path))
+            return
+        except BlockingIOError:  # the kernel's queue is full; it is emptied quickly
+            if time.monotonic() > until_s:
+                raise TimeoutError from None
+            time.sleep(0.001)
+
+
+def _of(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """The socket of a state folder, if there is one, and the note of its daemon."""
+    noted: dict[str, Any] = {}
+    with contextlib.suppress(OSError, ValueError, RecursionError):
+        found = json.loads((folder / DAEMON_FILE).read_bytes())
+        noted = found if isinstance(found, dict) and found.get("schema") == DAEMON_SCHEMA else {}
+    path = Path(str(noted.get("stop_socket") or folder / FILE))
+    with contextlib.suppress(OSError):
+        if path.is_socket():
+            yield path, noted

@@ -11,7 +11,7 @@ from typing import Any
 from calib.errors import BadFile
 from mastctl.answers import HeadPlace, PlaceList
 from mastctl.errors import BadRequest, NotKnown, Unable
-from mastctl.safety.state_file import StateFile
+from mastctl.safety.state_folder import StateFile
 
 FILE = "places.json"
 SCHEMA = "mastctl/places/1"

@@ -47,11 +47,10 @@ from mastctl.motion.tracker import Tracker
 from mastctl.recorder.entries import AttachedMast
 from mastctl.recorder.recorder import Recorder
 from mastctl.recorder.writer import Attached
-from mastctl.safety import heads, stop_socket
+from mastctl.safety import stop_socket
 from mastctl.safety.latch import Latch
-from mastctl.safety.state_folder import StateFolder
-from mastctl.safety.stop_socket import StopSocket
-from mastctl.safety.stop_threads import StopThreads
+from mastctl.safety.state_folder import StateFolder, other_head_folders
+from mastctl.safety.stop_socket import StopSocket, StopThreads
 from mastctl.service.masts import MastInUse, Masts, configured, read_mast
 from mastctl.service.places import Places
 from mastctl.service.state import (
@@ -136,7 +135,7 @@ class Service:
         self.folder = folder
         self.places = Places(self.folder.path)
         self.head_folder = head
-        beside = heads.others(head_name(config.hardware), head)
+        beside = other_head_folders(head_name(config.hardware), head)
         self.latch = Latch(folder, others=beside) if head is None else Latch(head, folder, beside)
         self.machine = StateMachine(clock, latched=self.latch.entries)
         publisher = self.machine.publisher

@@ -112,7 +112,7 @@ class Stopping:
         """Let no move out from now on; `estop` stops the head. Returns the cause that is latched."""
         self._machine.stop_requested()
         try:
-            cause = self._latch.hold(reason, name)
+            cause = self._latch.add(reason, name)
             self._machine.estop_requested(self._causes)
             self._block_moves()
         finally:

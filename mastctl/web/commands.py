@@ -19,7 +19,7 @@ from mastctl.control.idempotency import Answer
 from mastctl.errors import Unable
 from mastctl.http import PREFIX
 from mastctl.motion.requests import DeadlineS
-from mastctl.safety.stop_threads import StopsHang
+from mastctl.safety.stop_socket import StopsHang
 from mastctl.service.service import Service
 from mastctl.web.parts import Here, Parts
 

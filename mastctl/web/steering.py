@@ -55,7 +55,7 @@ from mastctl.motion.jog import JogBeat
 from mastctl.motion.requests import PointRequest, TrackRequest
 from mastctl.motion.results import PointingError
 from mastctl.safety.latch import LONGEST
-from mastctl.safety.stop_threads import StopsHang
+from mastctl.safety.stop_socket import StopsHang
 from mastctl.service.service import Service
 from mastctl.service.steering import usual_s
 from mastctl.web.commands import Asks, carried_out, command, stop_first

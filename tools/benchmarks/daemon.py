@@ -33,7 +33,7 @@ from hil_tests.support.living_daemon import simulated, started
 from mastctl.cli.options import at_least
 from mastctl.client import Client, ClientError
 from mastctl.packaged import default_config
-from mastctl.safety.stop_line import request
+from mastctl.safety.stop_socket import request
 from tools.command import end, heading, line, options
 
 HEADS = ("memory", "dynamixel", "ptu")

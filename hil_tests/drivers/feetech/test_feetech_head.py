@@ -35,7 +35,7 @@ from drivers.sim.wire.line import MemoryLine
 from drivers.simulation_clock import SimulationClock
 from hil_tests.drivers.turned import START_S, HangingHost, Turned
 from mastctl.cli.main import main
-from mastctl.safety import heads
+from mastctl.safety import state_folder
 
 PLAIN = AxisSettings(math.tau / 4096, 0.0, -3.0, 3.0, 1.0, 4.0)
 
@@ -277,8 +277,8 @@ def test_a_servo_that_unloads_itself_is_reported_and_moves_again() -> None:
 @pytest.fixture
 def cli(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Bench]:
     with bench() as it:
-        monkeypatch.setattr(heads, "SYSTEM", tmp_path / "no_such")
-        monkeypatch.setattr(heads, "_home", lambda: tmp_path)
+        monkeypatch.setattr(state_folder, "SYSTEM", tmp_path / "no_such")
+        monkeypatch.setattr(state_folder, "_home", lambda: tmp_path)
         monkeypatch.setattr(
             BusLink.__init__, "__kwdefaults__", {"clock": it.clock, "open_line": it.line.open}
         )

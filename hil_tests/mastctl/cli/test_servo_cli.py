@@ -19,7 +19,7 @@ from drivers.sim.wire.dynamixel_servo import OVERLOAD, SimulatedServo
 from drivers.sim.wire.line import MemoryLine
 from drivers.simulation_clock import SimulationClock
 from mastctl.cli.main import main
-from mastctl.safety import heads
+from mastctl.safety import state_folder
 
 BAUD = "1000000"
 PLAIN = AxisSettings(math.tau / 4096, 0.0, -3.0, 3.0, 1.0, 4.0)
@@ -42,8 +42,8 @@ class Bench:
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Bench]:
     it = Bench()
-    monkeypatch.setattr(heads, "SYSTEM", tmp_path / "no_such")
-    monkeypatch.setattr(heads, "_home", lambda: tmp_path)  # the name of a line in memory is a true line's
+    monkeypatch.setattr(state_folder, "SYSTEM", tmp_path / "no_such")
+    monkeypatch.setattr(state_folder, "_home", lambda: tmp_path)  # a line in memory has a true line's name
     monkeypatch.setattr(BusLink.__init__, "__kwdefaults__", {"clock": it.clock, "open_line": it.line.open})
     monkeypatch.setattr(ServoBench.scan, "__defaults__", (it.clock, it.line.open))
     with it.clock.at_work(), it.line:

@@ -19,9 +19,8 @@ from hil_tests.mastctl.safety.test_deaths import Bench, made
 from hil_tests.mastctl.service_fakes import rig
 from mastctl.cli.main import main
 from mastctl.client import Client
-from mastctl.safety import heads
 from mastctl.safety.latch import Latch
-from mastctl.safety.state_folder import StateFolder
+from mastctl.safety.state_folder import VARIABLE, StateFolder, take_head
 
 CAMERA = "navcam_left"
 SOURCE = '''
@@ -89,10 +88,10 @@ class Watched:
         head = DeviceSettings(self.bench.driver, self.document["pan_tilt"]["options"])
         name = head_name(HardwareSettings(head, {}))
         assert name is not None
-        place = heads.take(name) if state is None else StateFolder.named(state)
+        place = take_head(name) if state is None else StateFolder.named(state)
         assert place is not None
         latch = Latch(place)
-        latch.hold("sparks", "Ana")
+        latch.add("sparks", "Ana")
         latch.head_stopped()
         assert latch.kept_within(60.0)
         latch.close()
@@ -163,7 +162,7 @@ def test_a_latch_in_the_state_folder_alone_holds_too(
 ) -> None:
     """As a daemon left it that could not make the head's place, or that was of a version without one."""
     if place == "cannot be made":
-        monkeypatch.setenv(heads.VARIABLE, "/proc/nowhere")
+        monkeypatch.setenv(VARIABLE, "/proc/nowhere")
     watched.latch(tmp_path / "state")
     assert main(["camera", "sync", "--seconds", "1", "--config", watched.config]) == 1
     assert "an emergency stop is latched (Ana: sparks)" in capsys.readouterr().err

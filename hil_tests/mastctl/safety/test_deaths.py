@@ -25,7 +25,7 @@ from hil_tests.mastctl.service_fakes import rig
 from hil_tests.support.servo_rigs import line_alone
 from hil_tests.waiting import NET_S, present, until
 from mastctl.client import Client, ClientError
-from mastctl.safety.stop_line import request
+from mastctl.safety.stop_socket import request
 
 GOAL_RAD = 0.95
 SPEED_RAD_PER_S = 0.05  # the way takes 19 s: a stop on a busy machine still comes before its end

@@ -22,10 +22,9 @@ from hil_tests.mastctl.safety.test_deaths import Bench, made
 from hil_tests.waiting import NET_S, present, until
 from mastctl.client import Client, ClientError
 from mastctl.errors import NotNow
-from mastctl.safety import heads as heads_module
-from mastctl.safety.heads import head_folders
+from mastctl.safety import state_folder as state_folder_module
 from mastctl.safety.latch import FILE, USED, Latch
-from mastctl.safety.state_folder import StateFolder, StateInUse
+from mastctl.safety.state_folder import StateFolder, StateInUse, head_folders
 
 
 @pytest.fixture
@@ -141,14 +140,14 @@ def folder(tmp_path: Path) -> Iterator[StateFolder]:
 
 def test_a_latch_logs_its_causes_and_a_reset_releases_all(folder: StateFolder) -> None:
     latch = Latch(folder)
-    latch.hold("smoke", "Ana")
-    latch.hold("a hand in the way", "Ben")
-    latch.hold("smoke", "Ana")  # once in the log
-    latch.hold(None, None)
+    latch.add("smoke", "Ana")
+    latch.add("a hand in the way", "Ben")
+    latch.add("smoke", "Ana")  # once in the log
+    latch.add(None, None)
     latch.explain("smoke", "Ana")  # nor twice if it came after its stop
-    latch.hold("sparks", "Ana")
+    latch.add("sparks", "Ana")
     for number in range(10):
-        latch.hold("a stranger", f"client {number}")
+        latch.add("a stranger", f"client {number}")
     latch.head_stopped()
     assert latch.kept_within(NET_S)
     causes = [("Ana", "smoke"), ("Ben", "a hand in the way"), ("Ana", "sparks")]
@@ -205,8 +204,8 @@ def test_a_head_in_this_programs_memory_is_nobody_elses() -> None:
 
 def test_a_true_line_has_its_place_by_no_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Only lines of simulators follow $MASTCTL_HEADS, so that tests share nothing."""
-    monkeypatch.setattr(heads_module, "SYSTEM", tmp_path / "no_such")
-    monkeypatch.setattr(heads_module, "_home", lambda: tmp_path / "home")
+    monkeypatch.setattr(state_folder_module, "SYSTEM", tmp_path / "no_such")
+    monkeypatch.setattr(state_folder_module, "_home", lambda: tmp_path / "home")
     places = []
     for folder in ("one", "two"):
         for name in ("MASTCTL_HEADS", "HOME", "XDG_STATE_HOME", "STATE_DIRECTORY", "TMPDIR"):
@@ -222,32 +221,32 @@ def test_a_true_line_has_its_place_by_no_environment(tmp_path: Path, monkeypatch
 def test_a_latch_in_the_systems_or_in_the_users_place_blocks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(heads_module, "SYSTEM", tmp_path / "system")
-    monkeypatch.setattr(heads_module, "_home", lambda: tmp_path / "home")
+    monkeypatch.setattr(state_folder_module, "SYSTEM", tmp_path / "system")
+    monkeypatch.setattr(state_folder_module, "_home", lambda: tmp_path / "home")
     name = "usb-FTDI_A6008isP-if00-port0"
-    with contextlib.closing(present(heads_module.take(name))) as place:
+    with contextlib.closing(present(state_folder_module.take_head(name))) as place:
         latch = Latch(place)
-        latch.hold("smoke", "Ana")
+        latch.add("smoke", "Ana")
         latch.head_stopped()
         assert latch.kept_within(NET_S)
         latch.close()
         assert place.path.is_relative_to(tmp_path / "home")
     (tmp_path / "system").mkdir()
-    with contextlib.closing(present(heads_module.take(name))) as place:
+    with contextlib.closing(present(state_folder_module.take_head(name))) as place:
         assert place.path.is_relative_to(tmp_path / "system")
-        latch = Latch(place, others=heads_module.others(name, place))
+        latch = Latch(place, others=state_folder_module.other_head_folders(name, place))
         assert latch.entries[0].name == "Ana"
         latch.release("aired", "Ben")
     shutil.rmtree(tmp_path / "system")
-    with contextlib.closing(present(heads_module.take(name))) as place:
+    with contextlib.closing(present(state_folder_module.take_head(name))) as place:
         assert not Latch(place).entries
 
 
 def test_one_head_is_one_programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(heads_module, "SYSTEM", tmp_path / "no_such")
-    monkeypatch.setattr(heads_module, "_home", lambda: tmp_path / "home")
+    monkeypatch.setattr(state_folder_module, "SYSTEM", tmp_path / "no_such")
+    monkeypatch.setattr(state_folder_module, "_home", lambda: tmp_path / "home")
     with (
-        contextlib.closing(present(heads_module.take("usb-1"))),
+        contextlib.closing(present(state_folder_module.take_head("usb-1"))),
         pytest.raises(StateInUse, match="the head at usb-1 is driven by another program"),
     ):
-        heads_module.take("usb-1")
+        state_folder_module.take_head("usb-1")

@@ -26,8 +26,7 @@ from mastctl.control.standing import Latched
 from mastctl.errors import NotNow, Stopped, Unable
 from mastctl.safety import latch as latch_module
 from mastctl.safety.latch import FILE, Estopped, Latch
-from mastctl.safety.state_file import StateFile
-from mastctl.safety.state_folder import StateFolder, usual_folder
+from mastctl.safety.state_folder import StateFile, StateFolder, usual_folder
 from mastctl.service import stopping as stopping_module
 
 SECTOR_BYTES = 512
@@ -49,7 +48,7 @@ def folder(tmp_path: Path) -> Any:
 def latched(folder: StateFolder) -> Latch:
     """A latch with a stop that the disk holds."""
     latch = Latch(folder)
-    latch.hold("smoke", "Ana")
+    latch.add("smoke", "Ana")
     latch.head_stopped()
     assert latch.kept_within(NET_S)
     return latch
@@ -58,7 +57,7 @@ def latched(folder: StateFolder) -> Latch:
 def test_a_latched_stop_is_found_by_the_next_daemon(folder: StateFolder) -> None:
     latch = Latch(folder)
     assert not latch.entries
-    held = latch.hold("sparks at the\nmast", "Ana")
+    held = latch.add("sparks at the\nmast", "Ana")
     latch.head_stopped()
     assert latch.kept_within(NET_S)
     assert (held.reason, held.name) == ("sparks at the mast", "Ana")
@@ -70,14 +69,14 @@ def test_the_disk_waits_for_the_head_but_not_for_long(
 ) -> None:
     monkeypatch.setattr(latch_module, "HEAD_FIRST_S", 1e6)
     latch = Latch(folder)
-    latch.hold(None, None)
+    latch.add(None, None)
     assert not latch.kept_within(0.05)
     assert "not confirmed" in latch.not_kept
     latch.head_stopped()
     assert latch.kept_within(NET_S)
     monkeypatch.setattr(latch_module, "HEAD_FIRST_S", 0.05)
     latch.release("looked", "Ben")
-    latch.hold(None, None)
+    latch.add(None, None)
     assert latch.kept_within(NET_S)  # a head that hangs does not keep the disk
 
 
@@ -105,7 +104,7 @@ def test_a_latch_that_no_disk_takes_is_in_memory_and_a_fault(
 
     monkeypatch.setattr(StateFile, "write", write)
     latch = Latch(folder)
-    held = latch.hold("smoke", "Ana")
+    held = latch.add("smoke", "Ana")
     latch.head_stopped()
     assert not latch.kept_within(NET_S)
     assert latch.entries[0] == held
@@ -142,7 +141,7 @@ def test_a_stop_during_a_reset_wins(folder: StateFolder, monkeypatch: pytest.Mon
     def write(file: StateFile, document: Any) -> None:
         monkeypatch.setattr(StateFile, "write", true)
         true(file, document)
-        latch.hold("more smoke", "Cem")
+        latch.add("more smoke", "Cem")
 
     monkeypatch.setattr(StateFile, "write", write)
     with pytest.raises(NotNow, match="another emergency stop"):
@@ -154,10 +153,10 @@ def test_a_stop_during_a_reset_wins(folder: StateFolder, monkeypatch: pytest.Mon
 @pytest.mark.parametrize("reason", ["smoke", "\U0001f525" * 200])
 def test_a_power_cut_while_a_latch_is_written_reads_as_latched(folder: StateFolder, reason: str) -> None:
     latch, path = Latch(folder), folder.path / FILE
-    latch.hold("sparks", "Ana")
+    latch.add("sparks", "Ana")
     latch.release("\U0001f525" * 200, "Ben")
     old = path.read_bytes()
-    latch.hold(reason, "Cem")
+    latch.add(reason, "Cem")
     latch.head_stopped()
     assert latch.kept_within(NET_S)
     new = path.read_bytes()

@@ -13,7 +13,7 @@ import pytest
 from calib.errors import BadFile
 from calib.files.atomic import save_bytes
 from hil_tests.mastctl.safety.crash_states import Recorder, crash_states
-from mastctl.safety.state_file import StateFile
+from mastctl.safety.state_folder import StateFile
 
 SCHEMA = "mastctl/test/1"
 OLD, NEW = {"value": "old" * 40}, {"value": "new" * 700}

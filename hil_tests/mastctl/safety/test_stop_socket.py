@@ -20,11 +20,9 @@ from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, Hang, fake_dae
 from hil_tests.waiting import NET_S, until
 from mastctl.cli.main import main
 from mastctl.client import Client
-from mastctl.safety import stop_line as stop_line_module
 from mastctl.safety import stop_socket as stop_socket_module
 from mastctl.safety.state_folder import StateFolder, usual_folder
-from mastctl.safety.stop_line import NoAnswer, request
-from mastctl.safety.stop_socket import StopSocket
+from mastctl.safety.stop_socket import NoAnswer, StopSocket, request
 
 
 class Stops:
@@ -120,7 +118,7 @@ def test_a_stop_that_hangs_keeps_no_other_out(
 ) -> None:
     hang = Hang()
     monkeypatch.setattr(stops, "stop_answer", hang)
-    monkeypatch.setattr(stop_line_module, "ANSWER_S", 0.1)
+    monkeypatch.setattr(stop_socket_module, "ANSWER_S", 0.1)
     with pytest.raises(NoAnswer, match="may still move"):
         request(door.path, "stop")
     assert said(door.path, b"estop Ana: sparks\n").startswith("estop {")
@@ -208,6 +206,7 @@ def test_the_commands_work_with_a_broken_configuration(
     monkeypatch.delenv("MASTCTL_URL", raising=False)
     config = tmp_path / "daemon.yaml"
     config.write_text("schema: [")
+    monkeypatch.setattr("mastctl.config.load_config", None)  # it is not read at all
     other = tmp_path / "other" / "daemon.yaml"
     with contextlib.ExitStack() as stack:
         home = stack.enter_context(tempfile.TemporaryDirectory())  # a socket's path has to be short

@@ -19,7 +19,7 @@ from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import Stopped
 from mastctl.safety.latch import MOST
-from mastctl.safety.stop_line import request
+from mastctl.safety.stop_socket import request
 
 ANGLES: dict[str, Any] = {"pan_rad": 0.1, "tilt_rad": -0.1}
 Pair = tuple[RunningDaemon, FakeHardware]

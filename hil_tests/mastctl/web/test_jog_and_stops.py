@@ -13,7 +13,7 @@ from mastctl.client import Client, ClientError
 from mastctl.client.jog import Jog
 from mastctl.daemon import RunningDaemon
 from mastctl.motion import jog as jog_module
-from mastctl.safety.stop_line import request
+from mastctl.safety.stop_socket import request
 
 RATES = {"pan_rad_per_s": 0.2, "tilt_rad_per_s": 0.0}
 Pair = tuple[RunningDaemon, FakeHardware]
