@@ -90,7 +90,7 @@ class PointingExperiment:
     notes: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
-        """Return the document that ``--json`` prints, with all that is known of each distance."""
+        """Return the document that ``--json`` prints."""
         return {
             "url": self.url,
             "hardware": self.status.get("hardware"),
@@ -122,18 +122,18 @@ def _row_as_json(row: DistanceSummary) -> dict[str, Any]:
 
 def summarise_distance(distance_m: float, rows: Sequence[TargetRecord], seconds: float) -> DistanceSummary:
     """Return the table's row for the records of one distance; failed targets are counted, not averaged."""
-    firsts = [row.landings[0] for row in rows if len(row.landings) > 0]
-    seconds_ = [row.landings[1] for row in rows if len(row.landings) > 1]
+    first, second = ([row.landings[k] for row in rows if len(row.landings) > k] for k in range(2))
+    true = [[one.true_px for one in landings if one.true_px is not None] for landings in (first, second)]
     return DistanceSummary(
-        distance_m=distance_m,
-        targets=len(rows),
-        failed=sum(bool(row.error) for row in rows),
-        first_rms_px=rms([landing.residual_px for landing in firsts]),
-        second_rms_px=rms([landing.residual_px for landing in seconds_]),
-        true_first_rms_px=rms([landing.true_px for landing in firsts if landing.true_px is not None]),
-        true_second_rms_px=rms([landing.true_px for landing in seconds_ if landing.true_px is not None]),
-        worst_first_px=max((math.hypot(*landing.residual_px) for landing in firsts), default=None),
-        seconds=seconds,
+        distance_m,
+        len(rows),
+        sum(bool(row.error) for row in rows),
+        rms([one.residual_px for one in first]),
+        rms([one.residual_px for one in second]),
+        rms(true[0]),
+        rms(true[1]),
+        max((math.hypot(*one.residual_px) for one in first), default=None),
+        seconds,
     )
 
 
@@ -143,39 +143,6 @@ def rms(pairs: Sequence[tuple[float, float]]) -> tuple[float, float] | None:
         return None
     x, y = np.sqrt(np.mean(np.square(np.array(pairs, dtype=float)), axis=0))
     return float(x), float(y)
-
-
-class RunTime:
-    """The daemon's time of one run: ``started`` is the date, ``where`` the daemon's address.
-
-    A simulated rover whose time passes only on demand (``simulation.speed: max``) has neither date nor
-    address: the record of such a run is to be the same every time.
-    """
-
-    def __init__(self, client: Client) -> None:
-        self._client = client
-        self._began_s = self.now_s()
-        self.started = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-        self.where = client.url
-        if on_demand(client):
-            self.started = f"{self._began_s:.3f} s of the simulated rover's own time"
-            self.where = "a simulated rover"
-
-    def now_s(self) -> float:
-        """Return the daemon's time, seconds."""
-        return float(self._client.status()["now_s"])
-
-    def since_s(self, moment_s: float | None = None) -> float:
-        """Return how long the run, or what began at ``moment_s``, takes by now, seconds."""
-        return self.now_s() - (self._began_s if moment_s is None else moment_s)
-
-
-def on_demand(client: Client) -> bool:
-    """Whether the daemon is a simulated rover whose time passes only on demand."""
-    try:
-        return bool(client.simulation_time()["speed"] == "max")
-    except ClientError:  # anything else than this program's own simulated rover
-        return False
 
 
 # Targets lie this far to either side of straight ahead: the pan range of the paper's calibration (III.C).
@@ -203,50 +170,48 @@ def run_pointing_experiment(
 ) -> PointingExperiment:
     """Run the experiment and return its record.
 
-    Parameters
-    ----------
-    targets, first
-        How many targets at each distance, and the number of the first.
-    distances_m
-        Ranges from the camera to the ground where targets are searched.
-    seed
-        Chooses views and pixels. Each target has a draw of its own, whatever came before it.
-    notes
-        Sentences for the reader of the table.
-    on_target
-        Called after each target, failed or not.
-    pictures
-        How many targets of each distance keep their images for the report.
-
-    Raises
-    ------
-    ClientError
-        If the daemon cannot be reached or refuses for another reason than the target itself.
+    There are so many ``targets`` at each distance from the camera to the ground, from number ``first`` on,
+    each with a draw of its own by ``seed``. ``on_target`` is called after each, failed or not. Of each
+    distance ``pictures`` targets keep their images for the report; ``notes`` are for its reader. Raises
+    ClientError if the daemon cannot be reached or refuses for another reason than the target itself.
     """
-    clock = RunTime(client)
     status = client.status()
+    begun_s, started, url = status["now_s"], time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), client.url
+    if _on_demand(client):  # the record of such a run is to be the same every time
+        started, url = f"{begun_s:.3f} s of the simulated rover's own time", "a simulated rover"
     rig = parse_rig(client.mast_file(), "the daemon's mast file").rig
     pair = head_pair(rig, set(status["cameras"]))
     aim_px = rig.cameras[pair[0]].model.image_center_px
-    bench = _PointingRun(client, rig, pair, status["limits"], seed, truth, clock)
+    run = _PointingRun(client, rig, pair, status["limits"], seed, truth)
     records: list[TargetRecord] = []
     summaries = []
     for distance_m in distances_m:
-        distance_begun_s = clock.now_s()
+        distance_begun_s = _now_s(client)
         rows: list[TargetRecord] = []
         for index in range(first, first + targets):
             wanted = sum(bool(row.landed_images) for row in rows) < pictures
-            record = bench.one_target(distance_m, index, wanted)
+            record = run.one_target(distance_m, index, wanted)
             rows.append(record)
             if on_target is not None:
                 on_target(record)
         records += rows
-        summaries.append(summarise_distance(distance_m, rows, clock.since_s(distance_begun_s)))
-    seconds = clock.since_s()
+        summaries.append(summarise_distance(distance_m, rows, _now_s(client) - distance_begun_s))
     return PointingExperiment(
-        clock.where, status, seed, pair[0], aim_px, tuple(records), tuple(summaries), clock.started, seconds,
-        tuple(notes),
+        url, status, seed, pair[0], aim_px, tuple(records), tuple(summaries), started,
+        _now_s(client) - begun_s, tuple(notes),
     )  # fmt: skip
+
+
+def _now_s(client: Client) -> float:
+    return float(client.status()["now_s"])
+
+
+def _on_demand(client: Client) -> bool:
+    """Whether the daemon is a simulated rover whose time passes only on demand (``speed: max``)."""
+    try:
+        return bool(client.simulation_time()["speed"] == "max")
+    except ClientError:  # anything else than this program's own simulated rover
+        return False
 
 
 def head_pair(rig: Rig, served: set[str]) -> tuple[str, str]:
@@ -268,7 +233,7 @@ def head_pair(rig: Rig, served: set[str]) -> tuple[str, str]:
 
 @dataclass(frozen=True)
 class _PointingRun:
-    """The running experiment: the daemon, the rig as the daemon believes it, the seed."""
+    """The running experiment; ``rig`` as the daemon believes it."""
 
     client: Client
     rig: Rig
@@ -276,27 +241,25 @@ class _PointingRun:
     limits: Mapping[str, Any]
     seed: int
     truth: ClickTruth | None
-    clock: RunTime
 
     def one_target(self, distance_m: float, index: int, with_pictures: bool) -> TargetRecord:
         """Find one target at the distance, point at it twice, and return the record of it."""
-        begun_s = self.clock.now_s()
+        begun_s = _now_s(self.client)
         rng = np.random.default_rng([self.seed, round(1000 * distance_m), index])
         views = TargetViews(self.client, self.rig, self.pair, self.limits, rng, PAN_RANGE_RAD)
-        reason = ""
-        for _ in range(VIEWS_PER_TARGET):
-            try:
-                target = views.find_target(distance_m)
-            except ClientError as error:
-                reason = f"searching a target: {error}"
-                break
-            if target is not None:
-                return self._point_at(target, distance_m, index, begun_s, with_pictures)
-        reason = reason or f"no textured target found at {distance_m:g} m in {VIEWS_PER_TARGET} views"
+        reason = f"no textured target found at {distance_m:g} m in {VIEWS_PER_TARGET} views"
+        target = None
+        try:
+            for _ in range(VIEWS_PER_TARGET):
+                target = target or views.find_target(distance_m)
+        except ClientError as error:
+            reason = f"searching a target: {error}"
+        if target is not None:
+            return self._point_at(target, distance_m, index, begun_s, with_pictures)
         nan = math.nan
         return TargetRecord(
             distance_m, index, self.pair[0], "", (nan, nan), nan, nan, nan, (), reason,
-            self.clock.since_s(begun_s),
+            _now_s(self.client) - begun_s,
         )  # fmt: skip
 
     def _point_at(
@@ -314,12 +277,7 @@ class _PointingRun:
             error = f"{refusal.code}: {refusal}"
         entries = operation["pointings"] if operation is not None else []
         landings = tuple(self._landing(target, entry) for entry in entries)
-        images: tuple[Image, ...] = ()
-        if with_pictures:
-            images = tuple(
-                self.client.snapshot(target.shot.camera, frame_id=landing.frame_id).image
-                for landing in landings
-            )
+        images = [one.frame_id for one in landings] if with_pictures else []
         return TargetRecord(
             distance_m=distance_m,
             index=index,
@@ -331,10 +289,12 @@ class _PointingRun:
             tilt_before_rad=target.shot.tilt_rad,
             landings=landings,
             error=error,
-            seconds=self.clock.since_s(begun_s),
+            seconds=_now_s(self.client) - begun_s,
             operation=operation or {},
             clicked_image=target.shot.image if with_pictures else None,
-            landed_images=images,
+            landed_images=tuple(
+                self.client.snapshot(target.shot.camera, frame_id=one).image for one in images
+            ),
         )
 
     def _landing(self, target: Target, entry: Mapping[str, Any]) -> Landing:

@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from mastctl.client import Client
     from mastctl.daemon import RunningDaemon
 
+XY = tuple[float, float]
+
 
 def simulated_config(
     config: Config,
@@ -41,17 +43,11 @@ def simulated_config(
     wire: str | None = None,
     speed: float | str | None = None,
     seed: int | None = None,
-    bricks: int = 0,
 ) -> Config:
     """Return the configuration of a simulated rig on any free port; what is None stays as it is there.
 
-    A ``wire`` without a ``head`` has its usual one; ``bricks`` more stand in the scene. ``speed`` is
-    `drivers.simulation_clock.simulation_speed`'s.
-
-    Raises
-    ------
-    BadOptions
-        For a device that is not simulated: the truth of it is not known.
+    A ``wire`` without a ``head`` has its usual one. Raises BadOptions for a device that is not simulated: the
+    truth of it is not known.
     """
     hardware = config.hardware
     if real := not_simulated(hardware):
@@ -61,8 +57,6 @@ def simulated_config(
     given = (("head", head), ("wire", wire), ("speed", speed), ("seed", seed))
     simulation = {key: value for key, value in hardware.simulation.items() if key != "head" or wire is None}
     simulation |= {key: value for key, value in given if value is not None}
-    if bricks:
-        simulation["scene"] = {**simulation.get("scene", {}), "bricks": bricks}
     return replace(config, listen=Listen(port=0), hardware=replace(hardware, simulation=simulation))
 
 
@@ -90,15 +84,10 @@ def simulation_truth(rover: RoverModel) -> ClickTruth:
     """Return the truth about clicks in this rover's frames."""
 
     @cache
-    def point(frame_id: str, clicked_px: tuple[float, float]) -> FloatArray | None:
+    def point(frame_id: str, clicked_px: XY) -> FloatArray | None:
         return rover.true_point(*camera_and_sequence(frame_id), clicked_px)
 
-    def residual_px(
-        clicked_frame_id: str,
-        clicked_px: tuple[float, float],
-        landed_frame_id: str,
-        aim_px: tuple[float, float],
-    ) -> tuple[float, float] | None:
+    def residual_px(clicked_frame_id: str, clicked_px: XY, landed_frame_id: str, aim_px: XY) -> XY | None:
         clicked_m = point(clicked_frame_id, clicked_px)
         if clicked_m is None:
             return None
@@ -114,7 +103,6 @@ class Rover:
 
     head: str
     seed: int
-    bricks: int = 0
     mast_file: bytes | None = None
 
 
@@ -134,9 +122,7 @@ def running_rover(rover: Rover) -> Iterator[tuple[RunningDaemon, Client, RoverMo
     from mastctl.client import Client
     from mastctl.daemon import RunningDaemon  # late: `mastctl demo` compiles its renderer meanwhile
 
-    config = simulated_config(
-        load_config(None), head=rover.head, seed=rover.seed, bricks=rover.bricks, speed=MAX
-    )
+    config = simulated_config(load_config(None), head=rover.head, seed=rover.seed, speed=MAX)
     with tempfile.TemporaryDirectory() as folder:
         if rover.mast_file is not None:
             config = replace(config, mast_file=Path(folder) / "mast.yaml")

@@ -27,18 +27,14 @@ from mastctl.client import Client, ClientError, Snapshot
 
 BORDER_PX = 64  # nearer the edge than this a person would turn the head first
 TRIES_PER_VIEW = 8
-RANGE_SLACK = 0.12  # a target counts as "at 10 m" within this share of the distance
-TEXTURE_SIGMA_PX = 0.08  # what texture must hold a position to, one axis, at the grey noise below
+RANGE_SLACK = 0.12  # share of the distance within which a target is treated as "at 10 m"
+TEXTURE_SIGMA_PX = 0.08  # how sharply texture must fix a position, one axis, at the grey noise below
 NOISE_DN = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A pixel of a snapshot, its partner in the other camera (``right_px`` of ``right``), and its range.
-
-    ``kind`` says what it is: ``ground`` for a pixel chosen by its texture. ``point_m`` (3,) is where it is in
-    the rover frame, if that is known from elsewhere.
-    """
+    """A pixel of a snapshot, its partner in the other camera (``right_px`` of ``right``), and its range."""
 
     shot: Snapshot
     x_px: float
@@ -46,63 +42,10 @@ class Target:
     range_m: float
     right: Snapshot
     right_px: tuple[float, float]
-    kind: str = "ground"
-    point_m: FloatArray | None = None
-
-
-def choose_target(
-    left: Snapshot,
-    right: Snapshot,
-    left_in_rover: CameraModel,
-    right_in_rover: CameraModel,
-    distance_m: float,
-    rng: np.random.Generator,
-) -> Target | None:
-    """Return a random textured pixel of the left image at the distance, or None if a few tries find none.
-
-    ``left`` and ``right`` are of one stereo pair with the head at rest, their camera models at that moment in
-    the rover frame; the range from the left camera is within 12 % of ``distance_m``. The choice uses the two
-    images before the move only, so it cannot favour targets that land well.
-    """
-    candidates = texture_mask(left.image)
-    likely = candidates & on_level_ground(left_in_rover, distance_m)
-    rows, columns = np.nonzero(likely if likely.any() else candidates)
-    if len(rows) == 0:
-        return None
-    for pick in rng.integers(len(rows), size=TRIES_PER_VIEW):
-        pixel = np.array([columns[pick], rows[pick]], dtype=np.float64)
-        target = target_at(left, right, left_in_rover, right_in_rover, pixel)
-        if target is not None and abs(target.range_m - distance_m) <= RANGE_SLACK * distance_m:
-            return target
-    return None
-
-
-def target_at(
-    left: Snapshot,
-    right: Snapshot,
-    left_in_rover: CameraModel,
-    right_in_rover: CameraModel,
-    pixel: FloatArray,
-) -> Target | None:
-    """Return the target at a pixel (2,) of the left picture; None where the right one has no good match."""
-    own, other = PosedImage(grey(left.image), left_in_rover), PosedImage(grey(right.image), right_in_rover)
-    found = find_partner(own, pixel, other)
-    if found.match.verdict != "good":
-        return None
-    try:
-        point_m = triangulate(left_in_rover, right_in_rover, pixel, found.match.pixel_px).position_m
-    except NoStereoPoint:
-        return None
-    partner = (float(found.match.pixel_px[0]), float(found.match.pixel_px[1]))
-    range_m = float(np.linalg.norm(point_m - left_in_rover.C))
-    return Target(left, float(pixel[0]), float(pixel[1]), range_m, right, partner)
 
 
 def on_level_ground(camera_in_rover: CameraModel, distance_m: float) -> NDArray[np.bool_]:
-    """Return a mask (h, w) of pixels that see level ground (z = 0) near the distance.
-
-    It only saves tries: what counts is the range that stereo measures.
-    """
+    """Return a mask (h, w) of pixels that see level ground (z = 0) near the distance, to save tries."""
     width, height = camera_in_rover.size_px
     step = 8
     columns, rows = np.meshgrid(
@@ -116,7 +59,7 @@ def on_level_ground(camera_in_rover: CameraModel, distance_m: float) -> NDArray[
 
 
 def texture_mask(image: Image) -> NDArray[np.bool_]:
-    """Return a mask (h, w) of pixels whose surroundings hold a position to 0.08 px an axis at 2 DN of noise.
+    """Return a mask (h, w) of pixels whose surroundings fix a position to 0.08 px an axis at 2 DN of noise.
 
     The smaller eigenvalue of the gradient's structure tensor over 41x41 px bounds the variance of a match.
     """
@@ -148,21 +91,39 @@ class TargetViews:
     pan_range_rad: float
 
     def find_target(self, distance_m: float) -> Target | None:
-        """Turn to a random piece of ground at the distance and choose a pixel there, if it offers one.
+        """Turn to a random piece of ground at the distance and choose a textured pixel there, if it has one.
 
-        Raises ClientError if the daemon does not turn the head or gives no images.
+        The range from the left camera is within `RANGE_SLACK` of the distance. Raises ClientError if the
+        daemon does not turn the head or gives no images.
         """
-        pair = self.look_at(self._ground_ahead(distance_m))
+        pair = self._snapshots_of(self._ground_ahead(distance_m))
         if pair is None:
             return None
-        models = tuple(self.rig.camera_in_rover(shot.camera, *shot.true_rad) for shot in pair)
-        return choose_target(*pair, models[0], models[1], distance_m, self.rng)
+        left, right = (
+            PosedImage(grey(shot.image), self.rig.camera_in_rover(shot.camera, *shot.true_rad))
+            for shot in pair
+        )
+        # Chosen by images before the move only, so the choice cannot favour targets that land well.
+        candidates = texture_mask(pair[0].image)
+        likely = candidates & on_level_ground(left.camera, distance_m)
+        rows, columns = np.nonzero(likely if likely.any() else candidates)
+        for pick in self.rng.integers(len(rows), size=TRIES_PER_VIEW) if len(rows) else ():
+            pixel = np.array([columns[pick], rows[pick]], dtype=np.float64)
+            match = find_partner(left, pixel, right).match
+            if match.verdict != "good":
+                continue
+            try:
+                point_m = triangulate(left.camera, right.camera, pixel, match.pixel_px).position_m
+            except NoStereoPoint:
+                continue
+            range_m = float(np.linalg.norm(point_m - left.camera.C))
+            if abs(range_m - distance_m) <= RANGE_SLACK * distance_m:
+                partner = (float(match.pixel_px[0]), float(match.pixel_px[1]))
+                return Target(pair[0], float(pixel[0]), float(pixel[1]), range_m, pair[1], partner)
+        return None
 
-    def look_at(self, point_m: FloatArray) -> tuple[Snapshot, Snapshot] | None:
-        """Turn to a point (3,) of the rover frame and take both images; None outside the head's limits.
-
-        Raises ClientError if the daemon does not turn the head or gives no images.
-        """
+    def _snapshots_of(self, point_m: FloatArray) -> tuple[Snapshot, Snapshot] | None:
+        """Turn to a point (3,) of the rover frame and take both images; None outside the head's limits."""
         try:
             solutions = pointing.solve(self.rig.mast, self.rig.cameras[self.pair[0]].model, point_m)
             joints = self.rig.joints

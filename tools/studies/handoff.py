@@ -152,7 +152,7 @@ def _simulated(args: argparse.Namespace) -> list[HandoffRecord]:
             "no_handoff", f"{args.mast_file} has neither pancam and navcam nor navcam and hazcam pairs"
         )
     mast_file = None if args.mast_file is None else args.mast_file.read_bytes()
-    rover = Rover("ptu_d46_70", args.seed, 0, mast_file)
+    rover = Rover("ptu_d46_70", args.seed, mast_file)
     tasks = [HandoffTask(rover, source, index) for source in sources for index in range(args.targets)]
     parts = results_of(
         args, "hand-off", one_handoff, tasks, "from {0.source}, target {0.index}".format,
