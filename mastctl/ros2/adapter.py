@@ -1,4 +1,4 @@
-"""The adapter's life: ROS and the daemon joined, until a signal, or until ROS is gone."""
+"""Joins ROS and a daemon until a signal, or until ROS is gone."""
 
 from __future__ import annotations
 
@@ -41,35 +41,19 @@ def run(
     ros_args: Sequence[str],
     ready: Callable[[str], object],
 ) -> None:
-    """Be the adapter until an exception, a signal's KeyboardInterrupt as a rule; stops what ROS began.
+    """Run the node until an exception, a signal's KeyboardInterrupt as a rule; stops what ROS began.
 
-    Parameters
-    ----------
-    connect
-        Makes a client of the daemon.
-    prefix
-        Stands before the names of joints and frames.
-    base
-        The rover's frame with ROS's axes.
-    ros_args
-        What follows ``--ros-args``.
-    ready
-        Told the node's name when it is there.
-
-    Raises
-    ------
-    NoRos
-        If ROS is not installed, refuses its arguments, or ends.
-    ClientError
-        If the daemon does not answer at the beginning.
+    ``connect`` makes a client of the daemon; ``prefix`` and ``base`` as `RosNames`; ``ros_args`` follow
+    ``--ros-args``; ``ready`` gets the node's name when it is there. Raises NoRos if ROS is not installed,
+    refuses its arguments, or ends; ClientError if the daemon does not answer at the beginning.
     """
     check_ros()
     import rclpy
     from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
     from rclpy.signals import SignalHandlerOptions
 
-    from mastctl.ros2.names import RosNames
     from mastctl.ros2.node import MastNode
+    from mastctl.ros2.state import RosNames
 
     try:
         rclpy.init(args=["mastctl", "--ros-args", *ros_args], signal_handler_options=SignalHandlerOptions.NO)

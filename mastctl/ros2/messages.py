@@ -1,4 +1,4 @@
-"""What the daemon tells as ROS messages, and ROS messages as what it takes: no node, no connection."""
+"""Messages of ROS made of the daemon's answers: no node, no connection."""
 
 from __future__ import annotations
 
@@ -16,9 +16,8 @@ from std_msgs.msg import Header
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid, quaternion_of, rot_x, rot_y, rot_z, rotation_of
-from mastctl.ros2.known import KnownState
-from mastctl.ros2.names import RosNames
-from mastctl.ros2.times import NS, RosTime
+from mastctl.ros2.state import DaemonState, RosNames, RosTime
+from mastctl.ros2.tf_tree import NS
 
 OK, WARN, ERROR = 0, 1, 2
 LEVELS = {"fault": ERROR} | dict.fromkeys(("stopped", "stopping", "holding", "starting", "closing"), WARN)
@@ -27,11 +26,6 @@ LEVELS = {"fault": ERROR} | dict.fromkeys(("stopped", "stopping", "holding", "st
 def stamp(ns: int) -> Time:
     """Return nanoseconds since 1970 as ROS has them."""
     return Time(sec=ns // NS, nanosec=ns % NS)
-
-
-def stamp_ns(time: Time) -> int:
-    """Return a stamp as nanoseconds."""
-    return int(time.sec) * NS + int(time.nanosec)
 
 
 def joint_state(names: RosNames, at_ns: int, pan_rad: float, tilt_rad: float) -> JointState:
@@ -53,38 +47,38 @@ def moving_transforms(
     ]
 
 
-def fixed_transforms(names: RosNames, known: KnownState, rig: Rig, at_ns: int) -> list[TransformStamped]:
+def fixed_transforms(names: RosNames, state: DaemonState, rig: Rig, at_ns: int) -> list[TransformStamped]:
     """Return base <- rover <- mast, and each camera's optical frame in what carries it.
 
     The base has ROS's axes (x ahead, y left, z up), the rover those of mastctl (y right, z down).
     """
     carriers = {"head": names.head, "rover": names.rover}
-    told = [
+    return [
         transform(names.base, names.rover, at_ns, Rigid(np.diag([1.0, -1.0, -1.0]), np.zeros(3))),
         transform(names.rover, names.mast, at_ns, rig.mast.rover_from_mast),
+        *(
+            transform(carriers[camera.on], names.optical(name), at_ns, state.carrier_from_optical(rig, name))
+            for name, camera in rig.cameras.items()
+        ),
     ]
-    for name, camera in rig.cameras.items():
-        place = known.carrier_from_optical(rig, name)
-        told.append(transform(carriers[camera.on], names.optical(name), at_ns, place))
-    return told
 
 
 def transform(parent: str, child: str, at_ns: int, parent_from_child: Rigid) -> TransformStamped:
     """Return a transform as tf has it."""
-    told = TransformStamped(header=Header(stamp=stamp(at_ns), frame_id=parent), child_frame_id=child)
+    message = TransformStamped(header=Header(stamp=stamp(at_ns), frame_id=parent), child_frame_id=child)
     w, x, y, z = quaternion_of(parent_from_child.rotation)
-    place, turn = told.transform.translation, told.transform.rotation
+    place, turn = message.transform.translation, message.transform.rotation
     place.x, place.y, place.z = parent_from_child.translation_m.tolist()
     turn.w, turn.x, turn.y, turn.z = float(w), float(x), float(y), float(z)
-    return told
+    return message
 
 
-def rigid(told: TransformStamped) -> Rigid:
+def rigid(message: TransformStamped) -> Rigid:
     """Return parent_from_child of a transform. Raises ValueError if it is none."""
-    place, turn = told.transform.translation, told.transform.rotation
+    place, turn = message.transform.translation, message.transform.rotation
     quaternion = np.array([turn.w, turn.x, turn.y, turn.z])
     if not np.isfinite(quaternion).all() or np.linalg.norm(quaternion) < 0.1:
-        raise ValueError(f"the rotation of '{told.child_frame_id}' is no quaternion")
+        raise ValueError(f"the rotation of '{message.child_frame_id}' is no quaternion")
     return Rigid(rotation_of(quaternion / np.linalg.norm(quaternion)), np.array([place.x, place.y, place.z]))
 
 
@@ -113,30 +107,29 @@ def image(header: Header, jpeg: bytes) -> CompressedImage:
 
 def residual(header: Header, pixels: Sequence[float | None]) -> Vector3Stamped:
     """Return a residual, or its sigma, of an image, pixels: x right, y down, NaN where not measured."""
-    told = Vector3Stamped(header=header)
-    told.vector.x, told.vector.y = (float("nan") if one is None else float(one) for one in pixels)
-    return told
+    message = Vector3Stamped(header=header)
+    message.vector.x, message.vector.y = (float("nan") if one is None else float(one) for one in pixels)
+    return message
 
 
 def pointing(
     at_ns: int, name: str, state: str, message: str, operation: Mapping[str, Any] | None
 ) -> DiagnosticArray:
     """Return how an operation ended."""
-    told = {} if operation is None else {
-        key: operation.get(key) for key in ("residual_px", "residual_sigma_px", "position_m", "range_m")
-    }  # fmt: skip
+    keys = ("residual_px", "residual_sigma_px", "position_m", "range_m")
+    values = {} if operation is None else {key: operation.get(key) for key in keys}
     level = OK if state == "done" else ERROR
-    return diagnostics(at_ns, [status(name, level, message or state, {"state": state, **told})])
+    return diagnostics(at_ns, [status(name, level, message or state, {"state": state, **values})])
 
 
 def status(
     name: str, level: int, message: str, values: Mapping[str, Any], hardware: str = ""
 ) -> DiagnosticStatus:
     """Return one line of diagnostics."""
-    told = [KeyValue(key=key, value=str(value)) for key, value in values.items() if value is not None]
     return DiagnosticStatus(
-        level=bytes([level]), name=name, message=message, hardware_id=hardware, values=told
-    )
+        level=bytes([level]), name=name, message=message, hardware_id=hardware,
+        values=[KeyValue(key=key, value=str(value)) for key, value in values.items() if value is not None],
+    )  # fmt: skip
 
 
 def diagnostics(at_ns: int, lines: Iterable[DiagnosticStatus]) -> DiagnosticArray:
@@ -144,30 +137,28 @@ def diagnostics(at_ns: int, lines: Iterable[DiagnosticStatus]) -> DiagnosticArra
     return DiagnosticArray(header=Header(stamp=stamp(at_ns)), status=list(lines))
 
 
-def health(told: Mapping[str, Any], clock: RosTime) -> list[DiagnosticStatus]:
+def health(answer: Mapping[str, Any], clock: RosTime) -> list[DiagnosticStatus]:
     """Return a daemon's status as lines of diagnostics: state, clock, mast file, each camera, each fault."""
-    hardware = str(told["mast"]["name"])
-    control = told["control"]
-    state = told["state"]
+    hardware, control, state = str(answer["mast"]["name"]), answer["control"], answer["state"]
     lines = [
         status(
-            "mastctl: state", LEVELS.get(state, OK), f"{state}: {told['reason']}",
-            {"steers": control and control["holder"], "hardware": told["hardware"]}, hardware,
+            "mastctl: state", LEVELS.get(state, OK), f"{state}: {answer['reason']}",
+            {"steers": control and control["holder"], "hardware": answer["hardware"]}, hardware,
         ),
         _clock_line(clock, hardware),
     ]  # fmt: skip
-    calibration = told["calibration"]
+    calibration = answer["calibration"]
     if calibration is not None:
         level = WARN if calibration["verdict"] == "drifts" else OK
-        values = {"verdict": calibration["verdict"], "pointings": calibration["pointings"]}
+        values = {key: calibration[key] for key in ("verdict", "pointings")}
         lines.append(status("mastctl: mast file", level, calibration["sentence"], values, hardware))
-    faults: dict[str, list[Mapping[str, Any]]] = {name: [] for name in told["cameras"]}
-    for fault in told["faults"]:
+    faults: dict[str, list[Mapping[str, Any]]] = {name: [] for name in answer["cameras"]}
+    for fault in answer["faults"]:
         faults.setdefault(fault["device"], []).append(fault)
     for device, found in faults.items():
         values = {one["code"]: f"{one['message']}; until {one['until']}" for one in found}
-        words = "; ".join(one["message"] for one in found) or "no fault"
-        lines.append(status(f"mastctl: {device}", ERROR if found else OK, words, values, hardware))
+        message = "; ".join(one["message"] for one in found) or "no fault"
+        lines.append(status(f"mastctl: {device}", ERROR if found else OK, message, values, hardware))
     return lines
 
 
@@ -176,7 +167,10 @@ def _clock_line(clock: RosTime, hardware: str) -> DiagnosticStatus:
     if used is None:
         return status("mastctl: clock", ERROR, "the daemon's time is not known yet", {}, hardware)
     values = {"offset_s": f"{used.offset_ns / NS:.9f}", "doubt_s": f"{used.half_s:.6f}", "steps": clock.steps}
+    level, message = OK, "ROS time follows the daemon's clock"
     if not clock.steady:
-        words = f"the offset of ROS time from the daemon's clock has changed {clock.steps} times"
-        return status("mastctl: clock", WARN, words, values, hardware)
-    return status("mastctl: clock", OK, "ROS time follows the daemon's clock", values, hardware)
+        level, message = (
+            WARN,
+            f"the offset of ROS time from the daemon's clock has changed {clock.steps} times",
+        )
+    return status("mastctl: clock", level, message, values, hardware)

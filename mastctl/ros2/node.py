@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from importlib import import_module
 from typing import Any
 
@@ -25,40 +29,35 @@ from mastctl.client import Client, ClientError
 from mastctl.client.pictures import LivePicture
 from mastctl.ros2 import messages
 from mastctl.ros2.actions import Actions
-from mastctl.ros2.asked import Asked
-from mastctl.ros2.follow import Following
-from mastctl.ros2.known import KnownState
-from mastctl.ros2.names import RosNames
-from mastctl.ros2.steering import GoalOutcome, RosSteering
-from mastctl.ros2.times import NS, ClockExchange
+from mastctl.ros2.goals import Goal, GoalOutcome, Steering, angles_of, pixel_of, point_of
+from mastctl.ros2.state import ClockExchange, DaemonState, RosNames, real_from_monotonic_ns
+from mastctl.ros2.tf_tree import NS, stamp_ns
 
 log = logging.getLogger(__name__)
 
-LATCHED = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+LATCHED, MANY_LATCHED = (
+    QoSProfile(
+        depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+    )
+    for depth in (1, 100)
 )
-RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
-TF = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+RELIABLE, TF = (QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE) for depth in (10, 100))
 REASON = "reset_reason"
 NAME = "ROS 2"
 ENDED = ("done", "failed", "stopped")
+ENDS = 1000
+"""Operations whose end is remembered; the daemon itself keeps some 200."""
+AGAIN_S, STATUS_S, PICTURE_S = 1.0, 1.0, 0.1
+"""Between attempts to reach the daemon, between queries of its status, and the wait for a picture."""
 
 
 class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has it
-    """A node of one daemon.
-
-    Parameters
-    ----------
-    connect
-        Makes a client of the daemon.
-    names
-        Of joints and frames.
-    """
+    """A node of one daemon; ``connect`` makes a client of it. Its threads each have a client of their own."""
 
     def __init__(self, connect: Callable[[], Client], names: RosNames) -> None:
         super().__init__("mastctl")
         self.names = names
-        self.known = KnownState()
+        self.state = DaemonState()
         self._connect = connect
         self._cameras: tuple[str, ...] = ()
         self._own: set[str] = set()
@@ -66,20 +65,19 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         self._mast_digest = ""  # of the file that was read last, also of one that cannot be used
         self._images: dict[str, tuple[Any, Any]] = {}
         self._latched: dict[str, Any] = {}
+        self._ends: deque[str] = deque(maxlen=ENDS)
+        self._over = threading.Event()
+        self._threads: list[threading.Thread] = []
         self._make_publishers()
-        self.steering = RosSteering(connect)
-        self.following = Following(connect)
-        self.asked = Asked(names, self.known, self.steering, self._tell_refusal)
-        self._take()
-        self._actions = Actions(self, self.asked)
+        self.steering = Steering(connect)
+        self._subscribe()
+        self._actions = Actions(self, names, self.state, self.steering, self._begin_goal)
 
     def begin(self) -> None:
         """Follow the daemon from now on. Raises ClientError if it does not answer, or is refused."""
         with self._connect() as client:
-            status = client.status()
-            self._cameras = tuple(status["cameras"])
-            self.known.expect_ends(one["id"] for one in client.operations() if one["state"] in ENDED)
-        self.known.expect_images(self._cameras)
+            self._cameras = tuple(client.status()["cameras"])
+            self._ends.extend(one["id"] for one in client.operations() if one["state"] in ENDED)
         for name in self._cameras:
             topic = self.names.topic(name)
             self._images[name] = (
@@ -89,19 +87,88 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
                 self.create_publisher(CameraInfo, f"{topic}/camera_info", qos_profile_sensor_data),
             )
         self._read_rig()  # before the first image: its frame is then a camera's for whoever points at it
-        self.following.status(self._tell_status, self._tell_loss)
-        self.following.events(self._tell_event)
-        if self._cameras:
-            self.following.pictures(self._cameras, self._wanted, self._tell_picture)
+        for work in (self._follow_status, self._follow_events, self._follow_pictures):
+            thread = threading.Thread(target=self._again, args=(work,), name=work.__name__, daemon=True)
+            self._threads.append(thread)
+            thread.start()
 
     def close(self) -> None:
-        """Stop what ROS began, and publish no more."""
+        """Stop what ROS began, and publish no more; a thread that waits for the daemon is left to itself."""
         self.steering.close()
-        self.following.close()
+        self._over.set()
+        for thread in self._threads:
+            thread.join(2.0 * PICTURE_S)
 
     def now_ns(self) -> int:
         """Return ROS time, nanoseconds."""
         return int(self.get_clock().now().nanoseconds)
+
+    # Following the daemon
+
+    def _again(self, work: Callable[[Client], None]) -> None:
+        """Follow the daemon in one way, and again when it was lost and is back."""
+        reason = ""
+        while not self._over.is_set():
+            try:
+                with self._connect() as client:
+                    work(client)
+            except ClientError as error:
+                if str(error) != reason and not self._over.is_set():
+                    log.warning("%s", error)
+                reason = str(error)
+                if work == self._follow_status:
+                    line = messages.status("mastctl: state", messages.ERROR, reason, {})
+                    self._diagnostics.publish(messages.diagnostics(self.now_ns(), [line]))
+            except Exception:  # a defect must not end the thread
+                if not self._over.is_set():
+                    log.exception("a defect of the program")
+            self._over.wait(AGAIN_S)
+
+    def _follow_status(self, client: Client) -> None:
+        while not self._over.is_set():
+            sent_s = time.monotonic()
+            answer = client.status()
+            exchange = ClockExchange(sent_s, answer["now_s"], time.monotonic(), real_from_monotonic_ns())
+            clock = self.state.clock
+            if clock.update(exchange) and clock.exchange is not None:
+                self._offset.publish(Float64(data=clock.exchange.offset_ns / NS))
+            lines = messages.health(answer, clock)
+            self._diagnostics.publish(messages.diagnostics(self.now_ns(), lines))
+            self._over.wait(STATUS_S)
+
+    def _follow_events(self, client: Client) -> None:
+        for event in client.events("joints", "operation", "mast"):
+            value: Any = event["value"]
+            if event["topic"] == "mast" and value["digest"] != self._mast_digest:
+                self._read_rig()
+            elif event["topic"] == "joints":
+                self._publish_joints(value)
+            elif event["topic"] == "operation" and value["state"] in ENDED and event["key"] not in self._ends:
+                self._ends.append(event["key"])
+                self._publish_operation(value)
+            if self._over.is_set():
+                return
+
+    def _follow_pictures(self, client: Client) -> None:
+        """Publish pictures of the cameras that have a subscriber, when they come."""
+        if not self._cameras:
+            self._over.wait()
+            return
+        with client.live_pictures(*self._cameras) as line:
+            idle = set(self._cameras)
+            while not self._over.is_set():
+                for camera in filter(self._subscribed, tuple(idle)):
+                    idle.discard(camera)
+                    line.wanted(camera)
+                picture = line.next(PICTURE_S)
+                if picture is None:
+                    continue
+                camera = str(picture.facts["camera"])
+                if self._subscribed(camera):
+                    line.wanted(camera)  # before it is published: the next one is on its way meanwhile
+                    self._publish_picture(picture)
+                else:
+                    idle.add(camera)
 
     # Publishing
 
@@ -116,109 +183,75 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         try:
             self._tf_message = import_module("tf2_msgs.msg").TFMessage
         except ImportError:
-            log.warning("tf2_msgs is not installed: no /tf is published, and tf of others is not heard")
+            log.warning("tf2_msgs is not installed: no /tf is published, and tf of others is not received")
             return
         self._tf = self.create_publisher(self._tf_message, "/tf", TF)
         self._tf_static = self.create_publisher(self._tf_message, "/tf_static", LATCHED)
         group = ReentrantCallbackGroup()
-        self.create_subscription(
-            self._tf_message, "/tf", lambda told: self._heard(told, False), TF, callback_group=group
-        )
-        static = QoSProfile(
-            depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-        )
-        self.create_subscription(
-            self._tf_message, "/tf_static", lambda told: self._heard(told, True), static, callback_group=group
-        )
+        for topic, static, profile in (("/tf", False, TF), ("/tf_static", True, MANY_LATCHED)):
+            self.create_subscription(
+                self._tf_message, topic, lambda message, static=static: self._receive(message, static),
+                profile, callback_group=group,
+            )  # fmt: skip
 
-    def _publish_transforms(self, told: list[TransformStamped], static: bool) -> None:
-        for one in told:
+    def _publish_transforms(self, transforms: list[TransformStamped], static: bool) -> None:
+        for one in transforms:
             self._own.add(one.child_frame_id)
             self._put(one, static)
         if self._tf is not None:
-            (self._tf_static if static else self._tf).publish(self._tf_message(transforms=told))
+            (self._tf_static if static else self._tf).publish(self._tf_message(transforms=transforms))
 
-    def _heard(self, told: Any, static: bool) -> None:
-        for one in told.transforms:
+    def _receive(self, message: Any, static: bool) -> None:
+        for one in message.transforms:
             if one.child_frame_id not in self._own:
                 self._put(one, static)
 
-    def _put(self, told: TransformStamped, static: bool) -> None:
-        parent, child = told.header.frame_id.lstrip("/"), told.child_frame_id.lstrip("/")
+    def _put(self, one: TransformStamped, static: bool) -> None:
+        parent, child = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
         try:
-            self.known.tree.put(
-                parent, child, messages.stamp_ns(told.header.stamp), messages.rigid(told), static
-            )
+            self.state.tree.put(parent, child, stamp_ns(one.header.stamp), messages.rigid(one), static)
         except ValueError as error:
             log.warning("a transform of tf is left out: %s", error)
 
-    def _tell_status(self, told: dict[str, Any], exchange: ClockExchange) -> None:
-        if self.known.clock.heard(exchange):
-            used = self.known.clock.exchange
-            assert used is not None
-            self._offset.publish(Float64(data=used.offset_ns / NS))
-        lines = messages.health(told, self.known.clock)
-        self._diagnostics.publish(messages.diagnostics(self.now_ns(), lines))
-
-    def _tell_loss(self, why: str) -> None:
-        line = messages.status("mastctl: state", messages.ERROR, why, {})
-        self._diagnostics.publish(messages.diagnostics(self.now_ns(), [line]))
-
-    def _tell_event(self, topic: str, key: str, value: Any) -> None:
-        if topic == "mast" and value["digest"] != self._mast_digest:
-            self._read_rig()
-        if topic == "joints":
-            self._tell_joints(value)
-        elif topic == "operation" and value["state"] in ENDED and self.known.is_new_end(key):
-            self._tell_operation(value)
-
-    def _tell_joints(self, told: dict[str, Any]) -> None:
-        at_ns = self.known.clock.stamp_ns(told["measured_s"])
-        self.known.joints = told
-        if at_ns is None or self.known.rig is None:
+    def _publish_joints(self, joints: dict[str, Any]) -> None:
+        at_ns = self.state.clock.stamp_ns(joints["measured_s"])
+        self.state.joints = joints
+        rig = self.state.rig
+        if at_ns is None or rig is None:
             return
-        state = messages.joint_state(self.names, at_ns, told["pan_rad"], told["tilt_rad"])
-        self._joint_states.publish(state)
-        true_rad = told["true_pan_rad"], told["true_tilt_rad"]
-        self._publish_transforms(
-            messages.moving_transforms(self.names, self.known.rig, at_ns, *true_rad), False
+        self._joint_states.publish(
+            messages.joint_state(self.names, at_ns, joints["pan_rad"], joints["tilt_rad"])
         )
+        true_rad = joints["true_pan_rad"], joints["true_tilt_rad"]
+        self._publish_transforms(messages.moving_transforms(self.names, rig, at_ns, *true_rad), False)
 
-    def _tell_operation(self, told: dict[str, Any]) -> None:
-        error = told["error"]
-        message = "" if error is None else error["message"]
-        at_ns = self.known.clock.stamp_ns(told["ended_s"]) or self.now_ns()
-        self._pointings.publish(messages.pointing(at_ns, told["id"], told["state"], message, told))
-        if told["residual_px"] is None:
+    def _publish_operation(self, record: Mapping[str, Any]) -> None:
+        message = "" if record["error"] is None else record["error"]["message"]
+        at_ns = self.state.clock.stamp_ns(record["ended_s"]) or self.now_ns()
+        self._pointings.publish(messages.pointing(at_ns, record["id"], record["state"], message, record))
+        if record["residual_px"] is None:
             return
-        camera = next((one["camera"] for one in reversed(told["pointings"])), "")
+        camera = next((one["camera"] for one in reversed(record["pointings"])), "")
         header = Header(stamp=messages.stamp(at_ns), frame_id=self.names.optical(camera))
-        self._sigma.publish(messages.residual(header, told["residual_sigma_px"] or (None, None)))
-        self._residual.publish(messages.residual(header, told["residual_px"]))
+        self._sigma.publish(messages.residual(header, record["residual_sigma_px"] or (None, None)))
+        self._residual.publish(messages.residual(header, record["residual_px"]))
 
-    def _tell_refusal(self, what: str, outcome: GoalOutcome) -> None:
-        """Publish a wish of ROS that never became an operation."""
-        told = messages.pointing(self.now_ns(), what, outcome.state, outcome.message, None)
-        self._pointings.publish(told)
+    def _subscribed(self, camera: str) -> bool:
+        return any(publisher.get_subscription_count() for publisher in self._images[camera])
 
-    def _wanted(self, camera: str) -> bool:
-        image, info = self._images[camera]
-        return bool(image.get_subscription_count() or info.get_subscription_count())
-
-    def _tell_picture(self, picture: LivePicture) -> None:
+    def _publish_picture(self, picture: LivePicture) -> None:
         facts = picture.facts
-        at_ns = self.known.clock.stamp_ns(facts["mid_exposure_s"])
+        at_ns = self.state.clock.stamp_ns(facts["mid_exposure_s"])
         if at_ns is None:
             return
         camera = facts["camera"]
-        self.known.put_image(camera, at_ns, facts["frame_id"])
+        self.state.put_image(camera, at_ns, facts["frame_id"])
         image, info = self._images[camera]
         header = Header(stamp=messages.stamp(at_ns), frame_id=self.names.optical(camera))
         image.publish(messages.image(header, picture.jpeg))
-        told = self._infos.get(camera)
-        if told is not None:
-            told.header = header
-            info.publish(told)
+        if camera in self._infos:
+            self._infos[camera].header = header
+            info.publish(self._infos[camera])
 
     def _read_rig(self) -> None:
         """Take the mast file in use: fixed transforms, and each camera's lens with its worst error."""
@@ -233,37 +266,61 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         except BadFile as error:
             log.warning("no transforms and no camera_info: %s", error)
             return
-        self.known.use_rig(rig)
+        self.state.use_rig(rig)
         self._infos = {}
         for name in self._cameras:
-            if name not in self.known.lenses:
+            if name not in self.state.lenses:
                 continue
-            lens, twin, off = self.known.lenses[name]
+            lens, twin, off = self.state.lenses[name]
             log.info("%s: %s, at most %.4f px off", name, lens, off.worst_px)
             if name not in self._latched:
                 topic = f"{self.names.topic(name)}/camera_info_error_px"
                 self._latched[name] = self.create_publisher(Float64, topic, LATCHED)
             self._latched[name].publish(Float64(data=off.worst_px))
             self._infos[name] = messages.camera_info(lens, twin)
-        self._publish_transforms(messages.fixed_transforms(self.names, self.known, rig, self.now_ns()), True)
+        self._publish_transforms(messages.fixed_transforms(self.names, self.state, rig, self.now_ns()), True)
 
-    # What ROS asks
+    # What ROS requests
 
-    def _take(self) -> None:
+    def _subscribe(self) -> None:
         group = ReentrantCallbackGroup()
         self.declare_parameter(REASON, "")
-        self.create_subscription(
-            JointTrajectory, "joint_trajectory", self.asked.trajectory, RELIABLE, callback_group=group
-        )
-        self.create_subscription(
-            PointStamped, "point_at", self.asked.point_at, RELIABLE, callback_group=group
-        )
-        self.create_subscription(
-            PointStamped, "point_at_pixel", self.asked.point_at_pixel, RELIABLE, callback_group=group
-        )
+
+        def trajectory(message: Any) -> None:
+            if message.points:
+                self._begin_goal("joint_trajectory", lambda client: angles_of(message, self.names, client))
+            else:
+                self.steering.stop()
+
+        def point_at(message: Any) -> None:
+            self._begin_goal("point_at", lambda client: point_of(message, self.names, self.state))
+
+        def point_at_pixel(message: Any) -> None:
+            self._begin_goal("point_at_pixel", lambda client: pixel_of(message, self.names, self.state))
+
+        for kind, topic, take in (
+            (JointTrajectory, "joint_trajectory", trajectory),
+            (PointStamped, "point_at", point_at),
+            (PointStamped, "point_at_pixel", point_at_pixel),
+        ):
+            self.create_subscription(kind, topic, take, RELIABLE, callback_group=group)
         services = (("stop", self._stop), ("estop", self._estop), ("reset", self._reset))
         for name, answer in services:
             self.create_service(Trigger, f"~/{name}", answer, callback_group=group)
+
+    def _begin_goal(self, name: str, request: Callable[[Client], Mapping[str, Any]]) -> Goal:
+        goal = Goal(name, request)
+
+        def end(future: Future[GoalOutcome]) -> None:
+            outcome = future.result()
+            if outcome.operation is None:  # it never became an operation, whose end is published
+                self._pointings.publish(
+                    messages.pointing(self.now_ns(), name, outcome.state, outcome.message, None)
+                )
+
+        goal.outcome.add_done_callback(end)
+        self.steering.begin(goal)
+        return goal
 
     def _stop(self, request: Any, answer: Any) -> Any:
         try:
@@ -273,8 +330,8 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
 
     def _estop(self, request: Any, answer: Any) -> Any:
         def estop(client: Client) -> str:
-            told = client.estop(reason="asked by ROS 2", name=NAME)
-            return str(told.get("message") or "stopped and latched; ~/reset releases it")
+            record = client.estop(reason="requested by ROS 2", name=NAME)
+            return str(record.get("message") or "stopped and latched; ~/reset releases it")
 
         return self._answered(answer, estop)
 
@@ -292,10 +349,10 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
 
         return self._answered(answer, reset)
 
-    def _answered(self, answer: Any, ask: Callable[[Client], str]) -> Any:
+    def _answered(self, answer: Any, command: Callable[[Client], str]) -> Any:
         try:
             with self._connect() as client:
-                answer.message, answer.success = ask(client), True
+                answer.message, answer.success = command(client), True
         except ClientError as error:
             answer.message, answer.success = str(error), False
         return answer

@@ -1,4 +1,4 @@
-"""The adapter's pure parts: ROS time, the nearest lens, the frames of tf, and one wish at a time."""
+"""The adapter's pure parts: ROS time, the nearest lens, the frames of tf, and one goal at a time."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ from scipy.spatial.transform import Rotation
 from calib.files.mast_file import load_rig
 from calib.files.twin import grid_px
 from calib.geometry.rigid import Rigid, rot_z
-from hil_tests.waiting import until
+from hil_tests.waiting import NET_S, until
 from mastctl.client import ClientError
 from mastctl.packaged import config_folder
-from mastctl.ros2.known import ENDS, KnownState
-from mastctl.ros2.steering import GoalOutcome, RosSteering, Wish
+from mastctl.ros2.goals import Goal, Steering
+from mastctl.ros2.state import CALM, ClockExchange, DaemonState, RosTime
 from mastctl.ros2.tf_tree import NoTransform, TfTree
-from mastctl.ros2.times import CALM, ClockExchange, RosTime
 
 NS = 1_000_000_000
 REAL_NS = 1_795_000_000 * NS
@@ -30,7 +29,7 @@ ROUNDING_PX = 1e-6
 def test_a_stamp_on_the_daemons_own_machine_is_exact_to_the_nanosecond() -> None:
     clock = RosTime()
     assert clock.stamp_ns(5.0) is None
-    clock.heard(ClockExchange(100.0, 100.002, 100.004, REAL_NS))
+    clock.update(ClockExchange(100.0, 100.002, 100.004, REAL_NS))
     assert clock.stamp_ns(99.987654321) == REAL_NS + 99_987_654_321
     assert clock.steady
 
@@ -39,33 +38,33 @@ def test_a_far_clock_is_taken_from_the_quickest_exchange() -> None:
     clock = RosTime()  # the daemon's clock is 7 s behind; answers are late by different amounts
     for sent_s, there_s, back_s in ((100.0, 0.030, 0.010), (101.0, 0.001, 0.0012), (102.0, 0.050, 0.010)):
         now_s = sent_s + there_s - 7.0
-        clock.heard(ClockExchange(sent_s, now_s, sent_s + there_s + back_s, REAL_NS))
+        clock.update(ClockExchange(sent_s, now_s, sent_s + there_s + back_s, REAL_NS))
     used = clock.stamp_ns(50.0)
     assert used is not None
     assert abs(used - (REAL_NS + 57 * NS)) <= 0.0001 * NS  # half of 0.2 ms
     assert clock.steps == 0
 
 
-def test_a_clock_that_was_set_is_told_until_it_is_calm_again() -> None:
+def test_a_clock_that_was_set_is_reported_until_it_is_calm_again() -> None:
     clock = RosTime()
-    clock.heard(ClockExchange(10.0, 10.0, 10.0, REAL_NS))
-    assert clock.heard(ClockExchange(11.0, 11.0, 11.0, REAL_NS + 2 * NS))
+    clock.update(ClockExchange(10.0, 10.0, 10.0, REAL_NS))
+    assert clock.update(ClockExchange(11.0, 11.0, 11.0, REAL_NS + 2 * NS))
     assert (clock.steps, clock.steady) == (1, False)
     assert clock.stamp_ns(0.0) == REAL_NS + 2 * NS
     for k in range(CALM):
-        assert not clock.heard(ClockExchange(12.0 + k, 12.0 + k, 12.0 + k, REAL_NS + 2 * NS))
+        assert not clock.update(ClockExchange(12.0 + k, 12.0 + k, 12.0 + k, REAL_NS + 2 * NS))
     assert clock.steady
 
 
 @pytest.mark.parametrize("name", ["pancam_right", "navcam_left", "hazcam_left"])
 def test_a_lens_in_its_optical_frame_sees_what_the_camera_sees(name: str) -> None:
-    rig, known = load_rig(config_folder() / "masts" / "rocky8_simulated.yaml").rig, KnownState()
-    known.use_rig(rig)
+    rig, state = load_rig(config_folder() / "masts" / "rocky8_simulated.yaml").rig, DaemonState()
+    state.use_rig(rig)
     camera = rig.cameras[name].model
-    lens, twin, error = known.lenses[name]
+    lens, twin, error = state.lenses[name]
     pixels = grid_px(camera.size_px, (25, 19))
     rays = camera.ray(pixels)
-    points_m = known.carrier_from_optical(rig, name).inverse.points(rays.origins_m + 20.0 * rays.directions)
+    points_m = state.carrier_from_optical(rig, name).inverse.points(rays.origins_m + 20.0 * rays.directions)
     seen, _ = cv2.projectPoints(points_m, np.zeros(3), np.zeros(3), twin.camera_matrix, twin.distortion)
     off_px = np.linalg.norm(seen.reshape(-1, 2) - pixels, axis=1)
     assert off_px.max() <= error.worst_px + ROUNDING_PX
@@ -99,7 +98,7 @@ def test_a_way_through_tf_is_that_of_its_parts_between_their_stamps() -> None:
         ("map", "rover", 9, "1.000 s before the oldest"),
     ],
 )
-def test_what_tf_does_not_know_is_told(target: str, source: str, stamp_s: int, said: str) -> None:
+def test_what_tf_does_not_know_is_named(target: str, source: str, stamp_s: int, said: str) -> None:
     tree = TfTree()
     for at_s in (10, 11):
         tree.put("map", "rover", at_s * NS, Rigid.identity(), static=False)
@@ -112,7 +111,7 @@ class _Daemon:
     """Stands for a daemon and its client: operations end when they are stopped or allowed to."""
 
     def __init__(self) -> None:
-        self.told: list[str] = []
+        self.calls: list[str] = []
         self.lost = False
         self._end = threading.Event()
         self._state = "done"
@@ -125,12 +124,12 @@ class _Daemon:
 
     @contextmanager
     def lease(self, **options: Any) -> Any:
-        self.told.append("leased")
+        self.calls.append("leased")
         yield
-        self.told.append("released")
+        self.calls.append("released")
 
-    def point(self, **asked: Any) -> str:
-        self.told.append(f"point {asked['pan_rad']}")
+    def point(self, **request: Any) -> str:
+        self.calls.append(f"point {request['pan_rad']}")
         self._end.clear()
         self._state = "done"
         return "1"
@@ -142,7 +141,7 @@ class _Daemon:
         return {"state": self._state, "error": None}
 
     def stop_operation(self, operation: str) -> None:
-        self.told.append(f"stop {operation}")
+        self.calls.append(f"stop {operation}")
         self._state = "stopped"
         self._end.set()
 
@@ -150,52 +149,37 @@ class _Daemon:
         self._end.set()
 
 
-def _asked(steering: RosSteering, ends: dict[float, GoalOutcome], pan_rad: float) -> Wish:
-    wish = Wish(
-        f"pan {pan_rad}", lambda client: {"pan_rad": pan_rad}, lambda outcome: ends.update({pan_rad: outcome})
-    )
-    steering.ask(wish)
-    return wish
+def begun(steering: Steering, pan_rad: float) -> Goal:
+    goal = Goal(f"pan {pan_rad}", lambda client: {"pan_rad": pan_rad})
+    steering.begin(goal)
+    return goal
 
 
-def test_a_newer_wish_stops_the_one_before_and_the_end_stops_all() -> None:
-    daemon, ends = _Daemon(), dict[float, GoalOutcome]()
-    steering = RosSteering(lambda: daemon)  # type: ignore[arg-type, return-value]
-    _asked(steering, ends, 1.0)
-    until(lambda: "point 1.0" in daemon.told, "the first begins")
-    _asked(steering, ends, 2.0)
-    until(lambda: "point 2.0" in daemon.told, "the second begins")
-    assert daemon.told.index("stop 1") < daemon.told.index("point 2.0")
+def test_a_newer_goal_stops_the_one_before_and_the_end_stops_all() -> None:
+    daemon = _Daemon()
+    steering = Steering(lambda: daemon)  # type: ignore[arg-type, return-value]
+    first = begun(steering, 1.0)
+    until(lambda: "point 1.0" in daemon.calls, "the first begins")
+    second = begun(steering, 2.0)
+    until(lambda: "point 2.0" in daemon.calls, "the second begins")
+    assert daemon.calls.index("stop 1") < daemon.calls.index("point 2.0")
     steering.close()
-    assert daemon.told[-2:] == ["stop 1", "released"]
-    assert {key: one.state for key, one in ends.items()} == {1.0: "stopped", 2.0: "stopped"}
+    assert daemon.calls[-2:] == ["stop 1", "released"]
+    assert [goal.outcome.result(NET_S).state for goal in (first, second)] == ["stopped", "stopped"]
 
 
-def test_a_withdrawn_wish_is_stopped_and_a_lost_daemon_too() -> None:
-    daemon, ends = _Daemon(), dict[float, GoalOutcome]()
-    steering = RosSteering(lambda: daemon)  # type: ignore[arg-type, return-value]
-    wish = _asked(steering, ends, 1.0)
-    until(lambda: "point 1.0" in daemon.told, "it begins")
-    steering.withdraw(wish)
-    until(lambda: 1.0 in ends, "it ends")
-    assert daemon.told[-2:] == ["stop 1", "released"]
-    _asked(steering, ends, 2.0)
-    until(lambda: "point 2.0" in daemon.told, "the next begins")
+def test_a_withdrawn_goal_is_stopped_and_a_lost_daemon_too() -> None:
+    daemon = _Daemon()
+    steering = Steering(lambda: daemon)  # type: ignore[arg-type, return-value]
+    goal = begun(steering, 1.0)
+    until(lambda: "point 1.0" in daemon.calls, "it begins")
+    steering.withdraw(goal)
+    assert goal.outcome.result(NET_S).state == "stopped"
+    assert daemon.calls[-2:] == ["stop 1", "released"]
+    goal = begun(steering, 2.0)
+    until(lambda: "point 2.0" in daemon.calls, "the next begins")
     daemon.lost = True
-    until(lambda: 2.0 in ends, "it ends")
-    assert (ends[2.0].state, ends[2.0].code, daemon.told[-2:]) == (
-        "failed",
-        "no_daemon",
-        ["stop 1", "released"],
-    )
+    outcome = goal.outcome.result(NET_S)
+    assert (outcome.state, outcome.code) == ("failed", "no_daemon")
+    assert daemon.calls[-2:] == ["stop 1", "released"]
     steering.close()
-
-
-def test_each_end_of_an_operation_is_new_once_however_many_come() -> None:
-    known = KnownState()
-    known.expect_ends(["before"])
-    assert not known.is_new_end("before")
-    for number in range(20 * ENDS):
-        assert known.is_new_end(f"{number}")
-        assert not known.is_new_end(f"{number}")
-    assert known.ends == ENDS
