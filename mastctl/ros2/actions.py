@@ -16,7 +16,7 @@ from trajectory_msgs.msg import JointTrajectoryPoint
 
 from mastctl.client import Client
 from mastctl.ros2 import messages
-from mastctl.ros2.goals import Goal, GoalOutcome, Steering, aim_of, angles_of, point_of
+from mastctl.ros2.goals import Goal, GoalOutcome, RosSteering, aim_of, angles_of, point_of
 from mastctl.ros2.state import DaemonState, RosNames
 
 log = logging.getLogger(__name__)
@@ -35,7 +35,7 @@ class Actions:
         node: Node,
         names: RosNames,
         state: DaemonState,
-        steering: Steering,
+        steering: RosSteering,
         begin: Callable[[str, Callable[[Client], Mapping[str, Any]]], Goal],
     ) -> None:
         self._node, self._names, self._state = node, names, state

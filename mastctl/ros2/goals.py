@@ -61,7 +61,7 @@ class Goal:
     withdrawn: bool = False
 
 
-class Steering:
+class RosSteering:
     """Carries out goals in a thread of its own; `close` stops what runs.
 
     ``connect`` makes a client of the daemon.

@@ -29,7 +29,7 @@ from mastctl.client import Client, ClientError
 from mastctl.client.pictures import LivePicture
 from mastctl.ros2 import messages
 from mastctl.ros2.actions import Actions
-from mastctl.ros2.goals import Goal, GoalOutcome, Steering, angles_of, pixel_of, point_of
+from mastctl.ros2.goals import Goal, GoalOutcome, RosSteering, angles_of, pixel_of, point_of
 from mastctl.ros2.state import ClockExchange, DaemonState, RosNames, real_from_monotonic_ns
 from mastctl.ros2.tf_tree import NS, stamp_ns
 
@@ -69,7 +69,7 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         self._over = threading.Event()
         self._threads: list[threading.Thread] = []
         self._make_publishers()
-        self.steering = Steering(connect)
+        self.steering = RosSteering(connect)
         self._subscribe()
         self._actions = Actions(self, names, self.state, self.steering, self._begin_goal)
 

@@ -17,7 +17,7 @@ from calib.geometry.rigid import Rigid, rot_z
 from hil_tests.waiting import NET_S, until
 from mastctl.client import ClientError
 from mastctl.packaged import config_folder
-from mastctl.ros2.goals import Goal, Steering
+from mastctl.ros2.goals import Goal, RosSteering
 from mastctl.ros2.state import CALM, ClockExchange, DaemonState, RosTime
 from mastctl.ros2.tf_tree import NoTransform, TfTree
 
@@ -149,7 +149,7 @@ class _Daemon:
         self._end.set()
 
 
-def begun(steering: Steering, pan_rad: float) -> Goal:
+def begun(steering: RosSteering, pan_rad: float) -> Goal:
     goal = Goal(f"pan {pan_rad}", lambda client: {"pan_rad": pan_rad})
     steering.begin(goal)
     return goal
@@ -157,7 +157,7 @@ def begun(steering: Steering, pan_rad: float) -> Goal:
 
 def test_a_newer_goal_stops_the_one_before_and_the_end_stops_all() -> None:
     daemon = _Daemon()
-    steering = Steering(lambda: daemon)  # type: ignore[arg-type, return-value]
+    steering = RosSteering(lambda: daemon)  # type: ignore[arg-type, return-value]
     first = begun(steering, 1.0)
     until(lambda: "point 1.0" in daemon.calls, "the first begins")
     second = begun(steering, 2.0)
@@ -170,7 +170,7 @@ def test_a_newer_goal_stops_the_one_before_and_the_end_stops_all() -> None:
 
 def test_a_withdrawn_goal_is_stopped_and_a_lost_daemon_too() -> None:
     daemon = _Daemon()
-    steering = Steering(lambda: daemon)  # type: ignore[arg-type, return-value]
+    steering = RosSteering(lambda: daemon)  # type: ignore[arg-type, return-value]
     goal = begun(steering, 1.0)
     until(lambda: "point 1.0" in daemon.calls, "it begins")
     steering.withdraw(goal)
