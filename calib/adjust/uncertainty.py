@@ -20,8 +20,7 @@ from calib.adjust.result import (
 )
 from calib.adjust.terms import ImageTerm, lens_notes
 from calib.adjust.unknowns import MAST, Estimate
-from calib.geometry.covariance import pixel_rates
-from calib.geometry.landing import landing_rates
+from calib.geometry.covariance import landing_rates, pixel_rates
 from calib.geometry.parameters import parameter_names, parameter_part
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, tangents
@@ -256,7 +255,7 @@ def pointing_covariance(
 
     The target is ``range_m`` along the ray of ``left_px`` in the left image at the given joint angles. It is
     found by stereo with the calibrated rig, and the head is pointed so that it should land in the middle of
-    the left image (`calib.geometry.landing`).
+    the left image (`calib.geometry.covariance`).
 
     Raises
     ------

@@ -20,9 +20,9 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calib.geometry.lenses import Lens, Projection
 from calib.geometry.lenses.opencv import OpencvLens
 from calib.geometry.lenses.round import RoundLens
-from calib.geometry.projection import Lens, Projection
 from calib.geometry.rigid import FloatArray, ReadOnlyArrays, Rigid, frozen_array, tangents, turning
 
 Kind = Literal[
@@ -71,29 +71,14 @@ def letters_of(kind: str) -> str:
 
 @dataclass(frozen=True, eq=False)
 class CameraModel(ReadOnlyArrays):
-    """One camera; A and O are unit vectors.
+    """One camera, ``size_px`` (width, height) large. The letters are (3,) each, read-only.
 
-    Attributes
-    ----------
-    kind
-        Says which letters matter: CAHV ignores O, R and E, CAHVOR ignores E, OpenCV's families all three.
-        Those that do not matter are kept as O = A, R = 0, E = 0.
-    size_px
-        (width, height).
-    C, A, H, V, O, R, E
-        (3,) each, read-only. C in metres; A and O unit vectors; H and V in pixels; R and E as published.
-    cahvore_type
-        1 (perspective, linearity 1), 2 (fisheye, linearity 0) or 3 (``linearity`` as given); else 0.
-    distortion
-        (n,) OpenCV's coefficients in its order, 4 to 14 as the kind says; none of the CAHV family.
+    C in metres; A and O unit vectors; H and V in pixels; R and E as published. CAHV ignores O, R and E,
+    CAHVOR ignores E, OpenCV's families all three: they are kept as O = A, R = 0, E = 0. ``cahvore_type`` is 1
+    (perspective, linearity 1), 2 (fisheye, linearity 0) or 3 (``linearity`` as given); else 0. ``distortion``
+    (n,) are OpenCV's coefficients in its order, 4 to 14 as the kind says; none of the CAHV family. ValueError
+    names the letter if the parameters do not define a camera.
 
-    Raises
-    ------
-    ValueError
-        If the parameters do not define a camera; the sentence names the letter.
-
-    Notes
-    -----
     A point has a pixel if the lens reaches it. For CAHV and CAHVOR it is then in front of C along
     A and along O. For CAHVORE its ray is within the angle that the linearity allows (a right angle over
     ``linearity``, at most half a turn), and for both it is nearer to O than where the polynomial of R first
@@ -227,22 +212,12 @@ class CameraModel(ReadOnlyArrays):
         rotation: ArrayLike,
         C: ArrayLike,
     ) -> CameraModel:
-        """Return a camera of OpenCV's numbers; they come back from it to the last bit.
+        """Return a camera of OpenCV's families, or a CAHV, by its numbers; they come back to the last bit.
 
-        Parameters
-        ----------
-        kind
-            One of OpenCV's families, or CAHV, which has no ``distortion``.
-        camera_matrix
-            (3, 3) [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]; fx and fy of two signs mirror the image.
-        rotation, C
-            (3, 3) OpenCV's R: rows are the camera's x right, y down and z ahead in the frame of C (3,), where
-            the camera is, metres: -R^T t of OpenCV's t.
-
-        Raises
-        ------
-        ValueError
-            As the class; if the rotation or the matrix is none; if fy is negative.
+        ``camera_matrix`` is (3, 3) [[fx, skew, cx], [0, fy, cy], [0, 0, 1]]; a negative fx mirrors the image.
+        ``rotation`` (3, 3) is OpenCV's R: its rows are the camera's x right, y down and z ahead in the frame
+        of C (3,), where the camera is, metres: -R^T t of OpenCV's t. ValueError as the class, and if the
+        rotation or the matrix is none.
         """
         matrix, axes = _vector("camera_matrix", camera_matrix, (3, 3)), _vector("rotation", rotation, (3, 3))
         if (

@@ -12,6 +12,14 @@ Whether two clicks mean one point follows: two rays have four coordinates and a 
 over, how far the rays pass each other, is one number that is zero but for noise; its square over the variance
 that clicks and rig give it is chi-square with one degree of freedom. Along the epipolar line nothing can be
 tested: there every pixel is a point at another range.
+
+A target is clicked in a pair of cameras at one attitude of the head, ranged by it, and brought to a wanted
+pixel by the closed form. Errors of the rig's parameters move the ranged place p, and the direction in which
+the head then points. With the picture of the landing as truth the residual e is, to first order,
+
+    e = -(d pixel / d rig + d pixel / d p . d p / d rig),    d p / d rig = -d p / d clicks . d clicks / d rig,
+
+so that errors which ranging and pointing share cancel (`landing_rates`). A single camera is given the range.
 """
 
 from __future__ import annotations
@@ -26,8 +34,9 @@ from numpy.typing import ArrayLike
 
 from calib.errors import CalibError, NoStereoPoint
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.mode import Mode, in_mode, mode_rates, sensor_mode_after
+from calib.geometry.mode import Mode, in_mode, sensor_mode_after
 from calib.geometry.parameters import parameter_names, predict, stepped
+from calib.geometry.pointing import solve
 from calib.geometry.rig import (
     JOINTS_NAMES,
     MAST_NAMES,
@@ -54,10 +63,7 @@ _MAST = tuple(f"mast.{name}" for name in MAST_NAMES)
 class RigCovariance(ReadOnlyArrays):
     """How sure a rig's parameters are: ``names`` (p,) and ``covariance`` (p, p), in the names' units.
 
-    Raises
-    ------
-    ValueError
-        If the covariance is not (p, p), finite, and without negative variances.
+    ValueError if that is not (p, p), finite, and without negative variances.
     """
 
     names: tuple[str, ...]
@@ -88,10 +94,7 @@ class RigCovariance(ReadOnlyArrays):
 def stored_covariance(rig: Rig) -> RigCovariance | None:
     """Return the covariance of a rig's mast file, or None if it has none.
 
-    Raises
-    ------
-    CalibError
-        If ``fit.parameters`` and ``fit.covariance`` do not fit each other or the rig.
+    Raises CalibError if ``fit.parameters`` and ``fit.covariance`` do not fit each other or the rig.
     """
     if "covariance" not in rig.fit or "parameters" not in rig.fit:
         return None
@@ -126,7 +129,8 @@ def stored_covariance(rig: Rig) -> RigCovariance | None:
 def _impossible(covariance: FloatArray) -> bool:
     """Whether a matrix with a positive diagonal is no covariance, beyond what rounding does."""
     scale = np.sqrt(np.diag(covariance))
-    scaled = covariance / np.outer(*2 * [np.where(scale > 0.0, scale, 1.0)])
+    scale[scale == 0.0] = 1.0
+    scaled = covariance / np.outer(scale, scale)
     if np.abs(scaled - scaled.T).max(initial=0.0) > ROUNDING:
         return True
     return bool(np.linalg.eigvalsh(scaled).min(initial=0.0) < -ROUNDING)
@@ -292,10 +296,7 @@ def place_rates(
 ) -> PlaceRates:
     """Return how a point (3,) that a stereo pair shows, or one camera that is given the range, would move.
 
-    Raises
-    ------
-    CalibError
-        If a camera does not see the point.
+    Raises CalibError if a camera does not see the point.
     """
     point = position_m[None]
     seen = [pixel_rates(rig, names, camera, pan_rad, tilt_rad, point, approach) for camera in cameras]
@@ -310,6 +311,47 @@ def place_rates(
         left_px, right_px = (one.pixels_px[0] for one in seen)
         to_clicks = triangulate(models[0], models[1], left_px, right_px).rates_m_per_px
     return PlaceRates(to_clicks, -to_clicks @ np.concatenate([one.to_rig[0] for one in seen]))
+
+
+class LandingRates(NamedTuple):
+    """How far a target lands off, to first order: pixels for errors of the named parameters (2, p) and of the
+    clicks in k cameras (2, 2k); pixels a radian for pan and tilt at the click, and at the landing (2, 4)."""
+
+    to_rig: FloatArray
+    to_clicks: FloatArray
+    to_readings: FloatArray
+
+
+def landing_rates(
+    rig: Rig,
+    names: Sequence[str],
+    cameras: Sequence[str],
+    pan_rad: float,
+    tilt_rad: float,
+    target_m: FloatArray,
+    approaches: tuple[Approach, Approach] = (UNKNOWN, UNKNOWN),
+) -> LandingRates:
+    """Return how a target's landing in the middle of the first camera's image depends on what may be off.
+
+    ``names`` (p,) are parameters of the rig that may be off (`pixel_rates`), ``cameras`` those of the head in
+    which the target (3,), rover frame, is clicked at true angles: a pair, left one first, or one camera that
+    is given the range. ``approaches`` say from where the axes came to the click, and to the landing. Raises
+    CalibError if a camera does not see the target, or it cannot be pointed at.
+    """
+    every, size = (*names, *JOINT_NAMES), len(names)
+    place = place_rates(rig, every, cameras, pan_rad, tilt_rad, target_m, approaches[0])
+    camera, model = cameras[0], rig.cameras[cameras[0]].model
+    at = solve(rig.mast, model, target_m, from_pan_rad=pan_rad, from_tilt_rad=tilt_rad)[0]
+    landed = pixel_rates(rig, every, camera, at.pan_rad, at.tilt_rad, target_m[None], approaches[1])
+    by_place, by_rig = landed.to_points[0], landed.to_rig[0]
+    if not np.isfinite(by_rig).all():
+        raise CalibError(f"camera {camera} does not see the target where it should land")
+    clicking = by_place @ place.to_rig
+    return LandingRates(
+        -(by_rig[:, :size] + clicking[:, :size]),
+        -by_place @ place.to_clicks,
+        -np.hstack([clicking[:, size:], by_rig[:, size:]]),
+    )
 
 
 MOST_SIGMAS = 3.2905
@@ -377,12 +419,8 @@ def clicked_point(
     """Return the point that two clicks (2,) in a pair's pictures mean, rover frame, and the gap of its rays.
 
     ``sigma_px`` is that of each pixel coordinate of a click, ``sigma_rad`` of each joint reading. A camera of
-    which the rig's covariance says nothing is assumed to be wrong by ``RIG_PX``.
-
-    Raises
-    ------
-    NoStereoPoint
-        As `calib.geometry.stereo.triangulate`, and ``not_one_point``.
+    which the rig's covariance says nothing is assumed to be wrong by ``RIG_PX``. Raises NoStereoPoint as
+    `calib.geometry.stereo.triangulate`, and ``not_one_point``.
     """
     for name, pixel in zip(pair, (left_px, right_px), strict=True):
         if np.shape(pixel) != (2,):
@@ -417,11 +455,10 @@ def rig_in_mode(rig: Rig, camera: str, mode: Mode) -> Rig:
     as `in_mode`, and CalibError if the covariance does not fit the rig.
     """
     before = rig.cameras[camera]
-    model = in_mode(before.model, mode)
+    model, rates = in_mode(before.model, mode)
     fit: dict[str, object] = {}
     if (known := stored_covariance(rig)) is not None:
         names = [f"cameras.{camera}.{name}" for name in parameter_names(model.kind)]
-        rates = mode_rates(before.model, mode)
         whole = np.eye(len(known.names))
         at = {name: i for i, name in enumerate(known.names)}
         has = [i for i, name in enumerate(names) if name in at]

@@ -64,22 +64,13 @@ class PredictedPixel:
 
 @dataclass(frozen=True, eq=False)
 class Handoff:
-    """A target handed to other cameras.
+    """A target handed to other cameras, whose images were taken at ``pan_rad`` and ``tilt_rad``.
 
-    Attributes
-    ----------
-    seen, gap
-        The result of the source pair in the rover frame, its covariance from the clicks alone; and how far
-        its two rays pass each other.
-    covariance_m2
-        (3, 3) of the position from everything stated to be uncertain, rover frame.
-    pixels, reasons
-        By destination camera; where it does not see the target, None and the reason.
-    joint_px2
-        (2n, 2n) as ``search_px2`` of all n pixels that are not None, in their order, together: what they
-        share (the target's place, the calibration) moves them together.
-    pan_rad, tilt_rad
-        Joint angles of the destination images.
+    ``seen`` is what the source pair shows, rover frame, its covariance from the clicks alone, ``gap`` how far
+    its two rays pass each other, ``covariance_m2`` (3, 3) that of the position from everything stated to be
+    uncertain. ``pixels`` has None for a camera that does not see the target, ``reasons`` why. ``joint_px2``
+    (2n, 2n) is ``search_px2`` of all n pixels together, in their order: what they share (the target's place,
+    the calibration) moves them together.
     """
 
     seen: Triangulation
@@ -106,15 +97,9 @@ def hand_off(
 ) -> Handoff:
     """Hand a target, clicked (2,) in both images of a stereo pair, over to other cameras of body or head.
 
-    Parameters
-    ----------
-    joints, to_joints
-        Of the source and of the destination images. Without the latter both have one reading with one error.
-    sigma_px
-        Of each pixel coordinate of a click.
-    calibration
-        Covariance of the rig. Without it the returned covariances assume an exact rig, and the rays' gap is
-        judged by `calib.geometry.covariance.RIG_PX`.
+    Without ``to_joints`` source and destination images have one reading of the joints with one error.
+    ``sigma_px`` is that of each pixel coordinate of a click. Without a ``calibration`` the covariances assume
+    an exact rig, and the rays' gap is judged by `calib.geometry.covariance.RIG_PX`.
 
     Raises
     ------

@@ -25,14 +25,9 @@ FARTHEST_M = 1e5
 
 @dataclass(frozen=True, eq=False)
 class Sight(ReadOnlyArrays):
-    """A pixel of a picture, and what is known of the range of what it shows.
+    """A pixel (2,) of a camera's picture at true (pan, tilt), and what is known of the range that it shows.
 
-    Attributes
-    ----------
-    camera, joints_rad, pixel_px
-        Whose picture, the true (pan, tilt) then, and (2,) the pixel.
-    inverse_m, inverse_sigma_m
-        1/range from the ray's origin, and one sigma of it, both 1/m; a sigma of 0: the range was given.
+    ``inverse_m`` is 1/range from the ray's origin; a sigma of 0: the range was given.
     """
 
     camera: str
@@ -64,14 +59,10 @@ class Sight(ReadOnlyArrays):
 
 @dataclass(frozen=True, eq=False)
 class SeenFrom:
-    """Where a view should show what a sight is of.
+    """Where a view should show what a sight is of: the pixel (2,) at the likeliest range.
 
-    Attributes
-    ----------
-    pixel_px, along_px_m
-        (2,) at the likeliest range, and (2,) how it moves with the inverse range, px for 1/m.
-    covariance_px2
-        (2, 2) of all but the range: the sight's own pixel, mast file, joint readings of both views.
+    ``along_px_m`` (2,) is how it moves with the inverse range, px for 1/m, ``covariance_px2`` (2, 2) that of
+    all but the range: the sight's own pixel, mast file, joint readings of both views.
     """
 
     pixel_px: FloatArray
@@ -95,10 +86,7 @@ def range_to_plane(
 ) -> float:  # fmt: skip
     """Return the range, metres, at which a pixel's ray meets a plane of the rover frame.
 
-    Raises
-    ------
-    CalibError
-        If the pixel has no ray, or its ray goes along the plane or away from it.
+    Raises CalibError if the pixel has no ray, or its ray goes along the plane or away from it.
     """
     origin, direction = _ray(rig, Sight(camera, joints_rad, pixel_px, 0.0, 0.0))
     towards = float(direction @ normal) / float(np.linalg.norm(normal))
@@ -120,19 +108,10 @@ def seen_from(
 ) -> SeenFrom:
     """Return where a camera should show what a sight is of, at true (pan, tilt).
 
-    Parameters
-    ----------
-    sigma_px
-        Of each coordinate of the sight's pixel.
-    sigma_rad
-        Of each view's readings of pan and tilt; of two views at one pose they are the same error.
-    calibration
-        Covariance of the rig; without one `RIG_PX` is assumed for a view at other joint angles.
-
-    Raises
-    ------
-    CalibError
-        If the sight's pixel has no ray, or a camera cannot project the place.
+    ``sigma_px`` is that of each coordinate of the sight's pixel, ``sigma_rad`` of each view's readings of pan
+    and tilt; of two views at one pose they are the same error. Without a ``calibration`` `RIG_PX` is assumed
+    for a view at other joint angles. Raises CalibError if the sight's pixel has no ray, or a camera cannot
+    project the place.
     """
     known = calibration.of([sight.camera, camera]) if calibration else RigCovariance((), np.zeros((0, 0)))
     names, size = (*known.names, *JOINT_NAMES), len(known.names)

@@ -74,12 +74,8 @@ def maps_between(ideal: CameraModel, model: CameraModel) -> Maps:
 def rectified_pair(left: CameraModel, right: CameraModel, focal_px: float | None = None) -> RectifiedPair:
     """Return a pair with rows side by side: x along the baseline, z between the two cameras' A.
 
-    ``focal_px`` is that of the ideal cameras, by default the mean of the pair's.
-
-    Raises
-    ------
-    ValueError
-        If the sizes differ, the cameras are at one place, or face along their baseline.
+    ``focal_px`` is that of the ideal cameras, by default the mean of the pair's. ValueError if the sizes
+    differ, the cameras are at one place, or face along their baseline.
     """
     if left.size_px != right.size_px:
         raise ValueError(f"the left picture has {left.size_px} px and the right one {right.size_px}")

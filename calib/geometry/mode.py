@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from operator import index
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -71,22 +71,11 @@ class Mode:
 class SensorMode:
     """Which pixels of a sensor a camera's pictures show, as its driver reads it.
 
-    Attributes
-    ----------
-    size_px
-        (width, height) of the pictures.
-    crop_px
-        (x, y, width, height) of the part of the sensor that makes a picture, the sensor's pixels; None if the
-        driver does not report it.
-    sensor_px
-        (width, height) of all that can be read; None without ``crop_px``.
-    flip
-        Whether the camera turns its pictures (left to right, upside down).
-
-    Raises
-    ------
-    ValueError
-        If the size is none, the crop is not inside the sensor, or one of the two is missing.
+    ``size_px`` is (width, height) of the pictures, ``crop_px`` (x, y, width, height) of the sensor's part
+    that makes one and ``sensor_px`` (width, height) of all that can be read, both in the sensor's pixels, and
+    None if the driver does not report them. ``flip``: whether the camera turns its pictures (left to right,
+    upside down). ValueError if the size is none, the crop is not inside the sensor, or one of the two is
+    missing.
     """
 
     size_px: tuple[int, int]
@@ -125,12 +114,8 @@ def mode_between(then: SensorMode, now: SensorMode) -> Mode:
     """Return how pictures of one mode differ from those of another of the same camera.
 
     An unknown crop is treated as equal. Makers differ in the side from which the crop of a flipped picture
-    is counted, so such a crop has to be in the middle.
-
-    Raises
-    ------
-    BadMode
-        If no crop, binning and flip of the former pictures makes the present ones.
+    is counted, so such a crop has to be in the middle. Raises BadMode if no crop, binning and flip of the
+    former pictures makes the present ones.
     """
     flip = then.flip[0] != now.flip[0], then.flip[1] != now.flip[1]
     if then.crop_px is None or now.crop_px is None or then.sensor_px is None or now.sensor_px is None:
@@ -202,26 +187,18 @@ def _flips(flip: tuple[bool, bool]) -> list[str]:
     return [f"flip {' and '.join(sides)}"] if sides else []
 
 
-@dataclass(frozen=True)
-class PixelChange:
+class PixelChange(NamedTuple):
     """u' = ``scale`` u + ``shift`` along x and y, and the new picture's (width, height)."""
 
     scale: tuple[float, float]
     shift: tuple[float, float]
     size_px: tuple[int, int]
 
-    def pixels(self, pixels_px: FloatArray) -> FloatArray:
-        """Return where pixels (..., 2) of the calibrated picture are in the new one."""
-        return np.asarray(pixels_px * np.array(self.scale) + np.array(self.shift))
-
 
 def pixel_change(size_px: tuple[int, int], mode: Mode) -> PixelChange:
     """Return how a mode moves the pixels of a picture of ``size_px`` (width, height).
 
-    Raises
-    ------
-    BadMode
-        If the crop is not inside the picture, or binning does not divide it.
+    Raises BadMode if the crop is not inside the picture, or binning does not divide it.
     """
     width, height = size_px
     x, y, *cropped = mode.crop_px or (0, 0, width, height)
@@ -247,40 +224,33 @@ def pixel_change(size_px: tuple[int, int], mode: Mode) -> PixelChange:
     return PixelChange((scale[0], scale[1]), (shift[0], shift[1]), (size[0], size[1]))
 
 
-def in_mode(model: CameraModel, mode: Mode) -> CameraModel:
-    """Return a camera as it is in another mode. Raises BadMode as `pixel_change`.
+def in_mode(model: CameraModel, mode: Mode) -> tuple[CameraModel, FloatArray]:
+    """Return a camera as it is in another mode, and how a step (p,) of it follows one of the former: (p, p).
+
+    Raises BadMode as `pixel_change`.
 
     Examples
     --------
     >>> H, V = [500, 0, 319.5], [0, 500, 239.5]
     >>> camera = CameraModel("CAHV", (640, 480), C=[0, 0, 0], A=[0, 0, 1], H=H, V=V)
-    >>> half = in_mode(camera, Mode(binning=(2, 2)))
+    >>> half, _ = in_mode(camera, Mode(binning=(2, 2)))
     >>> half.size_px, half.H.tolist()
     ((320, 240), [250.0, 0.0, 159.5])
     """
     change = pixel_change(model.size_px, mode)
-    moved: dict[str, Any] = {
-        letter: change.scale[axis] * vector + change.shift[axis] * model.A
-        for axis, (letter, vector) in enumerate((("H", model.H), ("V", model.V)))
-    }
-    if mode.flip[1] and "D" in model.letters:
-        moved["distortion"] = model.distortion * _signs(model)
-    return replace(model, size_px=change.size_px, **moved)
-
-
-def mode_rates(model: CameraModel, mode: Mode) -> FloatArray:
-    """Return d new step / d step (p, p) of a camera's parameters: the change is linear in them."""
-    change = pixel_change(model.size_px, mode)
+    moved: dict[str, Any] = {}
     rates = np.eye(len(parameter_names(model.kind)))
-    turn = parameter_part(model.kind, "A")
-    for axis, letter in enumerate("HV"):
+    for letter, scale, shift in zip("HV", change.scale, change.shift, strict=True):
+        moved[letter] = scale * getattr(model, letter) + shift * model.A
         part = parameter_part(model.kind, letter)
-        rates[part, part] *= change.scale[axis]
-        rates[part, turn] = change.shift[axis] * tangents(model.A).T
+        rates[part, part] *= scale
+        rates[part, parameter_part(model.kind, "A")] = shift * tangents(model.A).T
     if mode.flip[1] and "D" in model.letters:
+        signs = _signs(model)
+        moved["distortion"] = model.distortion * signs
         part = parameter_part(model.kind, "D")
-        rates[part, part] *= _signs(model)
-    return rates
+        rates[part, part] *= signs
+    return replace(model, size_px=change.size_px, **moved), rates
 
 
 def _signs(model: CameraModel) -> FloatArray:

@@ -59,19 +59,10 @@ _Angle = TypeVar("_Angle", float, FloatArray)
 class AxisJoint:
     """One joint's errors; the default reads true.
 
-    Attributes
-    ----------
-    harmonics_rad
-        (c_i, s_i) of the first and second harmonic over a turn; may be shorter.
-    backlash_rad
-        Full width of the play between encoder and load. An estimate of none may be negative; a mast file has
-        no such value.
-
-    Raises
-    ------
-    ValueError
-        For more than two harmonics, numbers that are not finite, harmonics so large that two readings could
-        mean one angle, or a backlash above 0.2 rad.
+    ``harmonics_rad`` are (c_i, s_i) of the first and second harmonic over a turn; may be shorter.
+    ``backlash_rad`` is the full width of the play between encoder and load. An estimate of none may be
+    negative; a mast file has no such value. ValueError for more than two harmonics, numbers that are not
+    finite, harmonics so large that two readings could mean one angle, or a backlash above 0.2 rad.
     """
 
     harmonics_rad: tuple[Pair, ...] = ()
@@ -223,17 +214,8 @@ def _sin(at_rad: _Angle) -> _Angle:
 class Mast(ReadOnlyArrays):
     """Mast parameters: six of the paper, and axis offset a and twist k (0 in the paper's mast).
 
-    Attributes
-    ----------
-    translation_m, rotation_rad
-        (3,) origin of the mast frame in the rover frame, metres, and θx, θy, θz, radians.
-    axis_offset_m, axis_twist_rad
-        Length and twist of the common perpendicular from the pan axis to the tilt axis.
-
-    Raises
-    ------
-    ValueError
-        If a number is not finite.
+    The origin (3,) of the mast frame in the rover frame and θx, θy, θz (3,); then length and twist of the
+    common perpendicular from the pan axis to the tilt axis. ValueError if a number is not finite.
     """
 
     translation_m: FloatArray
@@ -252,10 +234,6 @@ class Mast(ReadOnlyArrays):
         """The fixed part: mast frame in the rover frame (paper eq. (7))."""
         x, y, z = self.rotation_rad
         return Rigid(rot_x(x) @ rot_y(y) @ rot_z(z), self.translation_m)
-
-    def mast_from_head(self, pan_rad: float, tilt_rad: float) -> Rigid:
-        """Return the moving part: head frame in the mast frame (paper eq. (8), with a and k)."""
-        return self.rover_from_mast.inverse @ self.rover_from_head(pan_rad, tilt_rad)
 
     def rover_from_head(self, pan_rad: float, tilt_rad: float) -> Rigid:
         """Return the head frame in the rover frame at true joint angles, radians."""

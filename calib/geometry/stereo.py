@@ -31,27 +31,18 @@ SIDES = ("left", "right")
 class Triangulation(ReadOnlyArrays):
     """A point seen by two cameras, or many (...) of them, in the frame of their models; read-only.
 
-    Attributes
-    ----------
-    position_m
-        (..., 3) middle of the common normal of the two rays.
-    covariance_m2
-        (..., 3, 3) from the pixel noise alone, to first order; camera and mast errors are not in it.
-    ray_gap_m
-        (...) length of the common normal: how far the rays pass each other. Large beside what the pixel noise
-        explains, it says that the two pixels are not of one point, or that the models are off; whether it is,
-        `calib.geometry.covariance` says.
-    ranges_m
-        (..., 2) from the left and from the right ray's origin to the foot of the normal on that ray.
-    rates_m_per_px
-        (..., 3, 4) d position / d (left x, left y, right x, right y).
-    gap_m_per_px
-        (..., 4) d gap / d (the same) where the rays meet. The gap is the triple product of both directions
-        and what lies between the origins, over the sine of their angle; the rates are those of the product.
-        It is linear in each direction, so they are right for pixels far off each other's lines too.
-    refused
-        (...) of text: empty where there is a point, else the code of `calib.errors.NoStereoPoint`; position,
-        covariance, gap and ranges are then not-a-number.
+    ``position_m`` (..., 3) is the middle of the common normal of the two rays, with its covariance
+    (..., 3, 3) from the pixel noise alone, to first order, and ``rates_m_per_px`` (..., 3, 4) to (left x,
+    left y, right x, right y). ``ranges_m`` (..., 2) go from each ray's origin to the normal's foot on it.
+    ``ray_gap_m`` (...) is the normal's length. Large beside what the pixel noise explains, it says that the
+    two pixels are not of one point, or that the models are off (`calib.geometry.covariance`).
+
+    ``gap_m_per_px`` (..., 4) are the gap's rates where the rays meet. The gap is the triple product of both
+    directions and what lies between the origins, over the sine of their angle; the rates are those of the
+    product. It is linear in each direction, so they are right for pixels far off each other's lines too.
+
+    ``refused`` (...) is empty where there is a point, else the code of `calib.errors.NoStereoPoint`;
+    position, covariance, gap and ranges are then not-a-number.
     """
 
     position_m: FloatArray
@@ -256,8 +247,6 @@ def target_approach_budget(
     instrument. The pixel size gives focal lengths in pixels, eq. (2). 3 sigma are 1 pixel of stereo at the
     start, and 2 % of the distance there of navigation.
 
-    Notes
-    -----
     While the target grows its place in the image is known no better than the first pixel was. The paper takes
     half of that growth as the disparity error at the end: ±5 pixels. A hand-off scales it by the ratio of
     focal lengths, so that the focal length of the first camera stays in eq. (4) and the baseline is the last

@@ -9,7 +9,7 @@ errors of its two joints eliminated. The prior is so wide that it only keeps dir
 has shown yet.
 
 From that follows how well the rig would point, over the whole of where it points
-(`calib.geometry.landing`): the figure that the choice of poses lowers.
+(`calib.geometry.covariance`): the figure that the choice of poses lowers.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ from itertools import product
 import numpy as np
 
 from calib.errors import CalibError
-from calib.geometry.covariance import JOINT_NAMES, pixel_rates
-from calib.geometry.landing import LandingRates, landing_rates
+from calib.geometry.covariance import JOINT_NAMES, LandingRates, landing_rates, pixel_rates
 from calib.geometry.parameters import parameter_names, parameter_part
 from calib.geometry.rig import JOINTS_NAMES, Approach, Gimbal, Rig, gimbal, numbers_of
 from calib.geometry.rigid import FloatArray, Rigid, rigid_rates

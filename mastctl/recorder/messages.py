@@ -99,7 +99,7 @@ def transforms(rig: Rig, pan_rad: float, tilt_rad: float, time_ns: int) -> Messa
     mast = rig.mast
     known: list[tuple[str, str, Rigid]] = [
         ("rover", "mast", mast.rover_from_mast),
-        ("mast", "head", mast.mast_from_head(pan_rad, tilt_rad)),
+        ("mast", "head", mast.rover_from_mast.inverse @ mast.rover_from_head(pan_rad, tilt_rad)),
     ]
     for name, camera in rig.cameras.items():
         known.append((camera.on, name, _carrier_from_optical(camera.model)))

@@ -1,23 +1,24 @@
-"""What all lenses share: from points in the lens frame to slopes, and from slopes to rays.
+"""From points to pixels and back: what all lenses share, and the plane of the image behind one.
 
-A lens has ``bend`` and ``unbend`` (with derivatives if wanted), ``coefficient_rates`` in the order of a
-camera's step, ``curved`` (slopes follow the angle, so a ray may be at a right angle to the axis and more),
-``moving`` (so does the entrance point), ``limit_rad`` (up to where it reaches in every direction) and
-``limit_reason`` (where it ends, as the end of a sentence; empty if that is where its family ends).
-
-The lens frame has its origin at C. A point (a, b, w) of it is seen at the *slopes* (u, v), those of the
-straight ray that a pinhole would need to land on the same pixel. `calib.geometry.projection` makes pixels of
-slopes. Callers cut their points into chunks that fit the cache and silence numpy's floating-point warnings;
-rows without a result come back with ``valid`` False and any number at all.
+A point is turned into the lens frame (origin C), bent into slopes by the lens, and a plane projection makes
+pixels of slopes; a ray goes the same way back. A point (a, b, w) of the lens frame is seen at the *slopes*
+(u, v), those of the straight ray that a pinhole would need to land on the same pixel. Nothing here changes
+when the camera moves: its place comes with each call as C and the lens frame's axes.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import isfinite
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from calib.geometry.rigid import FloatArray
+from calib.geometry.rigid import FloatArray, ReadOnlyArrays
+
+CHUNK = 8192
+"""Points at a time: some ten rows of them stay in a core's own cache."""
 
 TINY = 1e-150
 """Stands for zero in divisions by a distance from the axis: its square is still a number."""
@@ -45,6 +46,167 @@ class Unbent(NamedTuple):
     rates: FloatArray | None = None
     shift_m: FloatArray | None = None
     shift_rates: FloatArray | None = None
+
+
+class Lens(Protocol):
+    """A lens, in its own frame.
+
+    Callers cut their points into chunks that fit the cache and silence numpy's floating-point warnings; rows
+    without a result come back with ``valid`` False and any number at all.
+    """
+
+    @property
+    def curved(self) -> bool:
+        """Whether slopes follow the angle: a ray may be at a right angle to the axis and more."""
+
+    @property
+    def moving(self) -> bool:
+        """Whether the entrance point moves."""
+
+    @property
+    def limit_rad(self) -> float:
+        """The angle from the axis up to which the lens reaches in every direction."""
+
+    @property
+    def limit_reason(self) -> str:
+        """Where the lens ends, as the end of a sentence; empty if that is where its family ends."""
+
+    def bend(self, local_m: FloatArray, derivatives: bool = False) -> Bent:
+        """Return where points (3, n), rows a, b, w of the lens frame, are seen."""
+
+    def unbend(self, slopes: FloatArray, derivatives: bool = False) -> Unbent:
+        """Return the rays that land on slopes (2, n)."""
+
+    def coefficient_rates(self, local_m: FloatArray) -> FloatArray:
+        """Return d slope / d coefficient (2, k, n) of points (3, n), in the order of a camera's step."""
+
+
+@dataclass(frozen=True, eq=False)
+class Projection(ReadOnlyArrays):
+    """A lens with the plane behind it.
+
+    ``pixel_from_slope`` (3, 3) has H, V and A in the lens frame as rows: the camera matrix where the lens
+    frame's z is A; ``slope_from_pixel`` is its inverse.
+    """
+
+    lens: Lens
+    pixel_from_slope: FloatArray
+    slope_from_pixel: FloatArray
+
+    def project(
+        self, points: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool
+    ) -> tuple[FloatArray, FloatArray, np.ndarray]:
+        """Return pixels (n, 2), the Jacobians (n, 2, 3) if wanted, else none, and which are valid (n,).
+
+        ``points`` (n, 3) metres, ``center`` (3,) and ``axes`` (3, 3), the lens frame's as rows, are in one
+        frame.
+        """
+        count = len(points)
+        pixels, valid = np.empty((count, 2)), np.empty(count, dtype=bool)
+        jacobian = np.empty((count if derivatives else 0, 2, 3))
+        with np.errstate(all="ignore"):
+            for part in _chunks(count):
+                rates = jacobian[part].transpose(1, 2, 0)
+                self.forward(points[part], center, axes, pixels[part].T, rates, valid[part])
+        return pixels, jacobian, valid
+
+    def forward(
+        self,
+        points: FloatArray,
+        center: FloatArray,
+        axes: FloatArray,
+        pixels: FloatArray,
+        jacobian: FloatArray,
+        valid: np.ndarray,
+    ) -> None:
+        """Fill pixels (2, n), the Jacobian (2, 3, n) if not empty, and validity (n,); NumPy may warn."""
+        k = self.pixel_from_slope
+        local = axes @ np.subtract(points.T, center[:, None], order="C")
+        bent = self.lens.bend(local, jacobian.size > 0)
+        seen = k[:, :2] @ bent.slopes
+        seen += k[:, 2:]
+        depth = seen[2]
+        np.greater(depth if self.lens.curved else np.minimum(depth, k[2] @ local), 0.0, out=valid)
+        valid &= bent.valid
+        per_depth = np.divide(1.0, depth, out=depth)
+        np.multiply(seen[:2], per_depth, out=pixels)
+        if not isfinite(np.vdot(pixels.T, pixels.T)):
+            valid &= np.isfinite(pixels).all(axis=0)
+        if bent.rates is not None:
+            # Of the plane's three rows by the point, turned by the axes: one product of matrices.
+            turned = np.einsum("is,jl->ijsl", k[:, :2], axes.T).reshape(9, 6)
+            rows = (turned @ bent.rates.reshape(6, -1)).reshape(3, 3, -1)
+            if k[2, :2].any():
+                rows[:2] -= pixels[:, None] * rows[2]
+            np.multiply(rows[:2], per_depth, out=jacobian)
+        if not valid.all():
+            pixels[:, ~valid] = np.nan
+            jacobian[..., ~valid[: jacobian.shape[2]]] = np.nan
+
+    def rays(
+        self, pixels: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool
+    ) -> tuple[FloatArray, FloatArray, np.ndarray, FloatArray, FloatArray]:
+        """Return origins (n, 3), directions (n, 3) and validity (n,) of the rays of pixels (n, 2).
+
+        Then d direction / d pixel and d origin / d pixel, (n, 3, 2) each if wanted, else with no rows.
+        """
+        count, rows = len(pixels), len(pixels) if derivatives else 0
+        origins, directions, valid = np.empty((count, 3)), np.empty((count, 3)), np.empty(count, dtype=bool)
+        d_directions, d_origins = np.empty((rows, 3, 2)), np.zeros((rows, 3, 2))
+        filled = (origins, directions, valid, d_directions, d_origins)
+        with np.errstate(all="ignore"):
+            for part in _chunks(count):
+                self._rays(pixels[part], center, axes, *(array[part] for array in filled))
+        return filled
+
+    def _rays(
+        self,
+        pixels: FloatArray,
+        center: FloatArray,
+        axes: FloatArray,
+        origins: FloatArray,
+        directions: FloatArray,
+        valid: np.ndarray,
+        d_directions: FloatArray,
+        d_origins: FloatArray,
+    ) -> None:
+        """Fill the rays of one chunk, and their derivatives if these have rows."""
+        lens, k = self.lens, self.slope_from_pixel
+        seen = k[:, :2] @ pixels.T
+        seen += k[:, 2:]
+        slopes, per_w = seen[:2], seen[2]
+        np.greater(per_w, 0.0, out=valid)
+        np.divide(1.0, per_w, out=per_w)
+        slopes *= per_w
+        ray = lens.unbend(slopes, len(d_directions) > 0)
+        valid &= ray.valid & np.isfinite(ray.directions).all(axis=0)
+        if not lens.curved:
+            valid &= self.pixel_from_slope[2] @ ray.directions > 0.0
+        np.matmul(ray.directions.T, axes, out=directions)
+        origins[...] = center
+        if ray.shift_m is not None:
+            origins += ray.shift_m[:, None] * axes[2]
+
+        def by_pixel(rates: FloatArray) -> FloatArray:
+            """Rates (m, 2, n) to slopes as rates to pixels."""
+            per_pixel = np.tensordot(k[:2, :2], rates, axes=(0, 1)).swapaxes(0, 1)
+            per_pixel -= (rates * slopes).sum(axis=1)[:, None] * k[2, :2, None]
+            per_pixel *= per_w
+            return per_pixel
+
+        if ray.rates is not None:
+            turned = (axes.T @ ray.rates.reshape(3, -1)).reshape(3, 2, -1)
+            d_directions.transpose(1, 2, 0)[...] = by_pixel(turned)
+        if ray.shift_rates is not None:
+            d_origins[...] = axes[2][:, None] * by_pixel(ray.shift_rates[None])[0].T[:, None]
+        if not valid.all():
+            for array in (origins, directions, d_directions, d_origins):
+                array[~valid[: len(array)]] = np.nan
+
+
+def _chunks(count: int) -> Iterator[slice]:
+    """Cut ``count`` rows into slices that fit the cache."""
+    return (slice(start, min(start + CHUNK, count)) for start in range(0, count, CHUNK))
 
 
 def polynomial(coefficients: tuple[float, ...], y: FloatArray) -> FloatArray:

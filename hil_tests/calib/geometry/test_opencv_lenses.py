@@ -195,7 +195,7 @@ def test_pointing_brings_a_target_onto_the_pixel_by_cv2(kind: Kind) -> None:
         if np.hypot(*target[:2]) < 2.0:
             continue
         best = solve(mast, model, target, pixel)[0]
-        rover_from_head = mast.rover_from_mast @ mast.mast_from_head(best.pan_rad, best.tilt_rad)
+        rover_from_head = mast.rover_from_head(best.pan_rad, best.tilt_rad)
         in_rover = model.moved(rover_from_head)
         np.testing.assert_allclose(cv2_pixels(in_rover, target[None])[0], pixel, atol=1e-8)
 

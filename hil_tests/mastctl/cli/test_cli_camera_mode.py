@@ -30,7 +30,7 @@ def test_a_mast_file_of_a_mode_is_written_and_says_so(
     stored = load_rig(new)
     mode = "crop 48x40 px from (8, 4), binning 2x2, flip horizontal and vertical"
     assert (told["size_px"], told["mode"], told["digest"]) == ([24, 20], mode, stored.digest)
-    expected = in_mode(
+    expected, _ = in_mode(
         load_rig(mast).rig.cameras["navcam_left"].model, Mode((8, 4, 48, 40), (2, 2), (True, True))
     )
     found = stored.rig.cameras["navcam_left"].model
