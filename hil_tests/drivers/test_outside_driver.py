@@ -18,11 +18,11 @@ from drivers.errors import BadOptions
 from drivers.hardware import DeviceSettings, Hardware, HardwareSettings, clock_for
 from drivers.open_hardware import halt_head, open_hardware
 from drivers.registry import installed_drivers
+from mastctl.answers import PointingResult, Step
 from mastctl.devices.devices import Devices
 from mastctl.devices.limits import Limits
 from mastctl.motion.loop import PointingLoop
 from mastctl.motion.requests import PixelTarget, PointRequest
-from mastctl.motion.results import PointingResult, Step
 from mastctl.motion.settings import PointingSettings
 from mastctl.setup.machine import examine_drivers
 
@@ -66,15 +66,15 @@ def test_the_pointing_loop_runs_on_it(hardware: Hardware, mast_file: Path) -> No
         spot_px = (600, 330)
         target = PixelTarget("navcam_left", clicked.frame_id, *spot_px)
         result = point(pixel=target, pointings=2)
-        after = devices.frame_by_id(result.pointings[-1].frame_id)
+        after = devices.frame_by_id(result["pointings"][-1]["frame_id"])
     finally:
         devices.close()
-    assert [step.name for step in steps].count("measure") == 2
-    assert all(step.state == "done" for step in steps)
-    for pointing in result.pointings:
-        assert pointing.residual_px is not None
+    assert [step["name"] for step in steps].count("measure") == 2
+    assert all(step["state"] == "done" for step in steps)
+    for pointing in result["pointings"]:
+        assert pointing["residual_px"] is not None
         # The rig is exact, the head has no counts and no play: nothing but the matching is left.
-        assert np.abs(pointing.residual_px).max() < 0.2
+        assert np.abs(pointing["residual_px"]).max() < 0.2
     x, y = spot_px
     score = cv2.matchTemplate(
         after.image, clicked.image[y - 15 : y + 16, x - 15 : x + 16], cv2.TM_CCOEFF_NORMED

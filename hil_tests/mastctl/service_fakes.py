@@ -6,7 +6,7 @@ import functools
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +23,7 @@ from calib.geometry.rig import Mast, Rig, RigCamera
 from drivers.clock import Clock, SystemClock
 from drivers.interfaces import Camera, Frame, PanTilt, Reading
 from hil_tests.waiting import NET_S
+from mastctl.answers import Step
 from mastctl.client import Client
 from mastctl.config import load_config
 
@@ -174,47 +175,24 @@ class Hang:
         self._go.set()
 
 
-@dataclass(frozen=True)
-class FakeStep:
-    """A step as a record shows it."""
-
-    name: str
-    state: str
-    started_s: float
-    duration_s: float
-    detail: dict[str, Any]
+def fake_step(name: str, **detail: Any) -> Step:
+    """A step that is done."""
+    return Step(name=name, state="done", started_s=time.monotonic(), duration_s=0.01, detail=detail)
 
 
-@dataclass(frozen=True)
-class FakePointing:
-    """One pointing's measurement."""
-
-    residual_px: Any
-    residual_sigma_px: Any
-    frame_id: str
-    note: str = ""
-    commanded_pan_rad: float = 0.1
-    commanded_tilt_rad: float = -0.1
-    measured_pan_rad: float = 0.1
-    measured_tilt_rad: float = -0.1
-    true_pan_rad: float = 0.1
-    true_tilt_rad: float = -0.1
-    camera: str = "navcam_left"
-    aim_px: Any = None
-    predicted_px: Any = None
-    target_px: Any = None
-    predicted_sigma_px: Any = None
-    predicted_covariance_px2: Any = None
-    motion_evidence: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class FakeResult:
-    """What an operation ends with."""
-
-    position_m: Any
-    range_m: float | None
-    pointings: tuple[FakePointing, ...]
+def fake_result(position_m: Any, range_m: float, *residuals_px: Any, frame_id: str = "") -> dict[str, Any]:
+    """What an operation ends with: a pointing for each residual, of one sigma each."""
+    angles = ("commanded", "measured", "true")
+    rest = ("aim_px", "predicted_px", "target_px", "predicted_sigma_px", "predicted_covariance_px2")
+    common = {f"{one}_pan_rad": 0.1 for one in angles} | {f"{one}_tilt_rad": -0.1 for one in angles}
+    common |= dict.fromkeys(rest) | {
+        "camera": "navcam_left",
+        "frame_id": frame_id,
+        "note": "",
+        "motion_evidence": {},
+    }
+    measured = [common | {"residual_px": one, "residual_sigma_px": [0.1, 0.2]} for one in residuals_px]
+    return {"position_m": position_m, "range_m": range_m, "pointings": measured}
 
 
 class ScriptedLoop:
@@ -232,12 +210,12 @@ class ScriptedLoop:
     @staticmethod
     def good(request: Any, record: Callable[[Any], None], cancelled: threading.Event, devices: Any) -> Any:
         """Two steps and a residual."""
-        record(FakeStep("look", "done", time.monotonic(), 0.01, {"frame_ids": ["a", "b"]}))
+        record(fake_step("look", frame_ids=["a", "b"]))
         devices.move(0.1, -0.1)
         devices.read()  # the head has arrived, as after a real loop: the next picture is of a head at rest
-        record(FakeStep("measure", "done", time.monotonic(), 0.01, {"not_a_number": float("nan")}))
-        pointing = FakePointing(np.array([0.25, -0.5]), np.array([0.05, 0.06]), "navcam_left-000001-x-y")
-        return FakeResult(np.array([6.0, 0.0, 0.1]), 6.0, (pointing,))
+        record(fake_step("measure", not_a_number=float("nan")))
+        residual_px = np.array([0.25, -0.5])
+        return fake_result(np.array([6.0, 0.0, 0.1]), 6.0, residual_px, frame_id="navcam_left-000001-x-y")
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from hil_tests.mastctl.outside_daemon import daemon_process, line, under_way, write_config
-from hil_tests.mastctl.service_fakes import FakeHardware, FakeStep, ScriptedLoop
+from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, fake_step
 from hil_tests.waiting import NET_S, until
 from mastctl.client import Client, ClientError
 from mastctl.client import connection as connection_module
@@ -28,7 +28,7 @@ def go(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     let = threading.Event()
 
     def script(request: Any, record: Any, cancelled: threading.Event, devices: Any) -> Any:
-        record(FakeStep("look", "done", 0.0, 0.01, {}))
+        record(fake_step("look"))
         while not let.wait(0.01) and not cancelled.is_set():
             pass
         return ScriptedLoop.good(request, record, cancelled, devices)

@@ -22,8 +22,11 @@ from mastctl.answers.kinds import (
 from mastctl.answers.status import EstopHeld, PoseTold
 
 
-class StepTold(TypedDict):
-    """One step of an operation; ``detail`` has units in its names."""
+class Step(TypedDict):
+    """One step of an operation: what it was, how it ended, when, seconds of CLOCK_MONOTONIC.
+
+    ``detail`` has units in its names; of a failed step also ``code`` and ``message``.
+    """
 
     name: str
     state: Literal["done", "failed"]
@@ -32,8 +35,17 @@ class StepTold(TypedDict):
     detail: Json
 
 
-class PointingTold(TypedDict):
-    """One pointing, and what was measured after it in a new picture."""
+class Pointing(TypedDict):
+    """One pointing, and what was measured after it in a new picture.
+
+    The joint angles that were sent, those that the head read at the new picture's mid-exposure, and the true
+    ones then by the mast file's joints. ``aim_px`` is where the target was wanted, ``predicted_px`` where its
+    position, mast file and measured angles put it (null out of view), ``target_px`` where the picture shows
+    it; ``residual_px`` is target less aim, with one sigma of the match. They are null where nothing was
+    clicked that could be found again; ``note`` says why then. One sigma of the prediction and its (2, 2)
+    covariance are of what one camera alone knows, null where a pair measured. ``motion_evidence`` says by
+    camera whether the new pictures moved as the joints did, and how a later one repeated the measurement.
+    """
 
     commanded_pan_rad: float
     commanded_tilt_rad: float
@@ -54,7 +66,22 @@ class PointingTold(TypedDict):
     motion_evidence: dict[str, Json]
 
 
-class OperationListed(TypedDict):
+class PointingResult(TypedDict):
+    """Position in the rover frame, range from the aiming camera after the last pointing, and all pointings.
+
+    ``range_from`` says how the range is known: ``stereo``; ``given``, ``plane``, ``parallax`` or ``unknown``
+    with one camera; empty where nothing was clicked. ``range_interval_m``: with one camera, the ranges that
+    are 95 % likely after the last picture; the farther is null for infinity.
+    """
+
+    position_m: Point | None
+    range_m: float | None
+    range_from: str
+    range_interval_m: list[float | None] | None
+    pointings: list[Pointing]
+
+
+class OperationListed(PointingResult):
     """An operation without its steps; ``ended_because`` of a jog. Times of CLOCK_MONOTONIC."""
 
     id: str
@@ -66,18 +93,13 @@ class OperationListed(TypedDict):
     error: ErrorTold | None
     residual_px: MaybePixel | None
     residual_sigma_px: MaybePixel | None
-    position_m: Point | None
-    range_m: float | None
-    range_from: str
-    range_interval_m: list[float | None] | None
-    pointings: list[PointingTold]
     ended_because: NotRequired[str | None]
 
 
 class OperationTold(OperationListed):
     """``GET /operations/{id}``: the same with its steps."""
 
-    steps: list[StepTold]
+    steps: list[Step]
 
 
 class Operations(TypedDict):
@@ -107,7 +129,7 @@ class RefusedTold(TypedDict):
     message: str
 
 
-class PreviewTold(TypedDict):
+class Preview(TypedDict):
     """``POST /point/preview``: what a clicked pixel shows in a fresh frame, before anything moves.
 
     ``other_...``, the match's figures, ``sigma_m`` and ``range_sigma_m`` (one sigma, of the clicks and not of

@@ -19,7 +19,7 @@ from mastctl.cli.options import option
 from mastctl.cli.output import WrongUse
 
 if TYPE_CHECKING:
-    from mastctl.answers import OperationTold, StepTold
+    from mastctl.answers import OperationTold, Step
     from mastctl.client import Client
     from mastctl.config import Listen
 
@@ -121,7 +121,7 @@ def followed(client: Client, operation_id: str, as_json: bool, timeout_s: float)
     if as_json:
         return client.wait(operation_id, timeout_s)
 
-    def show(step: StepTold) -> None:
+    def show(step: Step) -> None:
         mark = "✓" if step["state"] == "done" else "✗"
         output.tell(f"{mark} {step['name']} ({step['duration_s']:.2f} s)")
 

@@ -14,12 +14,12 @@ from mastctl.answers import (
     Operations,
     OperationTold,
     PoseTaken,
-    PreviewTold,
+    Preview,
     ResetTold,
     Started,
     StateTold,
     Status,
-    StepTold,
+    Step,
     StopTold,
     TrackTold,
 )
@@ -163,7 +163,7 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         aim: tuple[str, float, float] | None = None,
         range_m: float | None = None,
         plane: Mapping[str, Sequence[float]] | None = None,
-    ) -> PreviewTold:
+    ) -> Preview:
         """Return what a pixel (camera, frame id, x, y) shows and where `point` would send the head.
 
         Nothing moves. ``position_m`` with ``sigma_m``, ``range_m``, the match in the other camera,
@@ -171,7 +171,7 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         `point`.
         """
         body = _target(pixel, None, None, aim, range_m, plane)
-        return self.daemon.json(PreviewTold, "POST", "/point/preview", json=body)
+        return self.daemon.json(Preview, "POST", "/point/preview", json=body)
 
     def operation(self, operation_id: str, timeout_s: float | None = None) -> OperationTold:
         """Return an operation's record; ``timeout_s`` as of `status`."""
@@ -194,7 +194,7 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         self,
         operation_id: str,
         timeout_s: float = 60.0,
-        on_step: Callable[[StepTold], None] | None = None,
+        on_step: Callable[[Step], None] | None = None,
     ) -> OperationTold:
         """Wait until an operation has ended (done, failed or stopped) and return its record.
 
@@ -317,7 +317,7 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         self,
         operation_id: str | None,
         timeout_s: float = 60.0,
-        on_step: Callable[[StepTold], None] | None = None,
+        on_step: Callable[[Step], None] | None = None,
     ) -> TrackTold:
         """Wait until a start or a look of the track has ended; return the track after it.
 

@@ -58,10 +58,7 @@ class Operation:
 
 def last_residual(result: Any, name: str) -> Residual | None:
     """Return the residual that a result ends with, if it measured one."""
-    pointings = getattr(result, "pointings", None) or ()
-    if not pointings:
-        return None
-    last = as_json(pointings[-1])
+    last = as_json(_last_pointing(result))
     residual, sigma = last.get("residual_px"), last.get("residual_sigma_px")
     if not (residual and sigma and None not in residual and None not in sigma):
         return None
@@ -70,6 +67,10 @@ def last_residual(result: Any, name: str) -> Residual | None:
 
 def last_frame(result: Any) -> str | None:
     """Return the id of the image that a result ends with, None where it took none."""
-    pointings = getattr(result, "pointings", None) or ()
-    frame_id = getattr(pointings[-1], "frame_id", None) if pointings else None
-    return frame_id if isinstance(frame_id, str) and frame_id else None
+    return _last_pointing(result).get("frame_id") or None
+
+
+def _last_pointing(result: Any) -> Mapping[str, Any]:
+    """The last pointing of a result that has some, an empty one of any other."""
+    pointings = result.get("pointings") if isinstance(result, Mapping) else None
+    return pointings[-1] if pointings else {}

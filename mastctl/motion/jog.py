@@ -29,8 +29,7 @@ from mastctl.control.operations import OperationRunner
 from mastctl.devices.judge import KeepOutJudge
 from mastctl.devices.keep_out import KeptOut, Pair
 from mastctl.errors import NotNow
-from mastctl.motion.requests import Name, StrictBody
-from mastctl.motion.results import PointingError
+from mastctl.motion.requests import Name, PointingError, StrictBody
 
 log = logging.getLogger(__name__)
 

@@ -15,15 +15,14 @@ pose; so a fresh pair is always taken, the clicked patch is found in it, and ran
 each move the clicked patch itself, never a later copy of it, is searched, so nothing drifts.
 
 What the loop does not do: it does not retry, and it reports no residual on a match that is not good, or that
-a later image does not repeat (`mastctl.motion.evidence`).
+a later image does not repeat (`mastctl.motion.measurement`).
 """
 
 from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -35,35 +34,27 @@ from calib.geometry.stereo import Triangulation, triangulate
 from calib.matching.partner import StereoMatch
 from calib.matching.verdict import PatchMatch
 from drivers.errors import DriverError
-from mastctl.answers import PreviewTold
+from mastctl.answers import Pointing, PointingResult, Preview
 from mastctl.as_json import as_json
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.keep_out import Pair
 from mastctl.errors import MastctlError
-from mastctl.motion.evidence import check_one_moment
+from mastctl.motion.measurement import CameraView, Clicked, match_facts, rounded
 from mastctl.motion.one_camera import OneCamera
-from mastctl.motion.requests import Aim, PixelTarget, PointRequest, aim_of
-from mastctl.motion.results import (
-    Pointing,
-    PointingError,
-    PointingResult,
-    pair,
-    rounded,
-    triple,
-)
+from mastctl.motion.requests import Aim, PixelTarget, PointingError, PointRequest, aim_of
 from mastctl.motion.steps import FoundAgain, Steps
-from mastctl.motion.views import CameraView, Clicked, match_facts
 
 log = logging.getLogger(__name__)
 
 NO_PICTURE_OF_A_POSITION = "no residual: a position has no picture that could be looked for"
-ONLY_OF_PAIRS = (
-    "other_camera", "other_frame_id", "other_pixel_px", "other_sigma_px", "correlation", "second",
-    "across_px", "sigma_m", "range_sigma_m", "range_interval_m",
-)  # fmt: skip
-"""Of a preview; null where one camera points alone (but for its interval of ranges)."""
 NO_TARGET = "no residual: joint angles name no target; no picture was taken"
+NOT_MEASURED: dict[str, Any] = {
+    "camera": "", "frame_id": "", "aim_px": None, "predicted_px": None, "target_px": None,
+    "residual_px": None, "residual_sigma_px": None, "predicted_sigma_px": None,
+    "predicted_covariance_px2": None, "note": "", "motion_evidence": {},
+}  # fmt: skip
+"""What a pointing has beside its angles, where nothing was measured."""
 
 
 class PointingLoop(Steps):
@@ -73,7 +64,10 @@ class PointingLoop(Steps):
     _range_m: float | None = None
     _one_camera: OneCamera | None = None
     _range_from = ""
-    _pointings: tuple[Pointing, ...] = ()
+
+    def __init__(self, *parts: Any) -> None:
+        super().__init__(*parts)
+        self._pointings: list[Pointing] = []
 
     def run(self, request: PointRequest) -> PointingResult:
         """Carry out the request; blocks until it is done, at most the sum of its deadlines.
@@ -93,7 +87,7 @@ class PointingLoop(Steps):
         assert result is not None
         return result
 
-    def preview(self, request: PointRequest) -> PreviewTold:
+    def preview(self, request: PointRequest) -> Preview:
         """Return what a pixel request would point at and where the head would go; nothing moves.
 
         Raises MastctlError, DriverError, CalibError if what was clicked is not found, or has no range.
@@ -131,7 +125,7 @@ class PointingLoop(Steps):
             }
         goal, refused = self._goal_of(aim)
         answer = {
-            **dict.fromkeys(ONLY_OF_PAIRS),
+            **dict.fromkeys(Preview.__annotations__),
             **about,
             "camera": found.now.frame.camera,
             "frame_id": found.now.frame.frame_id,
@@ -141,17 +135,16 @@ class PointingLoop(Steps):
             "goal_rad": goal,
             "refused": refused,
         }
-        return cast(PreviewTold, as_json(answer))
+        return cast(Preview, as_json(answer))
 
-    def _goal_of(self, aim: Aim) -> tuple[Pair | None, Mapping[str, str] | None]:
+    def _goal_of(self, aim: Aim) -> tuple[Pair | None, dict[str, str] | None]:
         """The readings that the head would be sent to, and why it would not."""
         goal: Pair | None = None
         try:
-            now = self.head.read()
-            best = self._chosen(aim, np.array([aim.x_px, aim.y_px]), now, {})
+            now = self.read()
+            best = self._solved(aim, np.array([aim.x_px, aim.y_px]), now, {})
             goal = self._devices.goal((best.pan_rad, best.tilt_rad), now)
-            self._limits.check(*goal)
-            self.head.check_goal(*goal)
+            self.check_goal(*goal)
         except (MastctlError, CalibError) as error:
             message = " ".join(str(error).split())
             return goal, {"code": getattr(error, "code", "failed"), "message": message}
@@ -161,15 +154,15 @@ class PointingLoop(Steps):
         if request.angles_rad is not None:
             self.rest()
             settled = self.go(*request.angles_rad)
-            self._done(_pointing(request.angles_rad, settled, note=NO_TARGET))
+            self._pointings.append(_pointing(request.angles_rad, settled, note=NO_TARGET))
             return
         aim, target = aim_of(request, self._rig), request.pixel
         aim_px = np.array([aim.x_px, aim.y_px])
         if target is None:
             self._position_m = np.array(request.position_m)
             commanded, settled = self._solve_and_go(aim, aim_px, self.rest())
-            now = self.look((aim.camera,), settled)[aim.camera]
-            self._done(self._measured(commanded, now, aim_px, None))
+            now = self.capture((aim.camera,), settled)[aim.camera]
+            self._measured(commanded, now, aim_px, None)
         elif self._is_alone(request, target):
             self._point_by_one(self._sight(request, target)[1], aim, aim_px, request.pointings)
         else:
@@ -181,18 +174,13 @@ class PointingLoop(Steps):
             clicked = Clicked(found.view, found.clicked_px, plane, relief=relief)
             self._point_by_pair(clicked, aim, aim_px, request.pointings)
 
-    def _done(self, pointing: Pointing) -> None:
-        """Keep a pointing; the steps that follow belong to the next."""
-        self._pointings = (*self._pointings, pointing)
-        self.pointing += 1
-
     def _in_stereo(self, target: PixelTarget) -> tuple[FoundAgain, StereoMatch, Triangulation]:
         """Find the clicked thing in a fresh pair, and its position."""
         found = self.clicked(target)
         now, other = found.now, found.other
         assert other is not None
         with self.step("stereo") as detail:
-            detail.update(check_one_moment(self.cameras, now, found.pixel_px, [other], found.resting))
+            detail.update(self.cameras.check_one_moment(now, found.pixel_px, [other], found.resting))
             partnered = self.cameras.stereo(now, found.pixel_px, other)
             detail.update(match_facts(partnered.match), across_px=round(partnered.across_px, 3))
         return found, partnered, self._triangulate(now, found.pixel_px, other, partnered.match)
@@ -219,11 +207,11 @@ class PointingLoop(Steps):
             self._position_m = one.position_m
             resting = self.rest() if number > 1 else None
             commanded, settled = self._solve_and_go(aim, aim_px, resting)
-            now = self.look((aim.camera,), settled)[aim.camera]
+            now = self.capture((aim.camera,), settled)[aim.camera]
             with self.step("measure") as detail:
                 expected = one.expected(now)
                 try:
-                    seen = self.cameras.look_for(clicked, now)
+                    seen = self.cameras.find(clicked, now)
                 except PointingError as error:
                     if one.range_from != "unknown" or not error.code.startswith("target_"):
                         raise
@@ -235,15 +223,12 @@ class PointingLoop(Steps):
                 detail.update(predicted_px=rounded(expected.pixel_px), **one.check(now, seen, expected))
             match_px = float(seen.sigma_px.max())
             later, again = self.repeated(clicked, now, seen, settled, aim_px)
-            pointing = self._measured(commanded, later, aim_px, again)
             known = expected.whole_px2(one.sight.inverse_sigma_m) + match_px**2 * np.eye(2)
-            self._done(
-                replace(
-                    pointing,
-                    predicted_sigma_px=pair(np.sqrt(np.diag(known))),
-                    predicted_covariance_px2=(pair(known[0]), pair(known[1])),
-                )
-            )
+            predicted = {
+                "predicted_sigma_px": np.sqrt(np.diag(known)).tolist(),
+                "predicted_covariance_px2": known.tolist(),
+            }
+            self._measured(commanded, later, aim_px, again, **predicted)
             with self.step("range") as detail:
                 one.learn(now, seen.pixel_px, match_px, expected)
                 detail.update(one.facts())
@@ -273,10 +258,10 @@ class PointingLoop(Steps):
             commanded, settled = self._solve_and_go(aim, aim_px, self.rest() if number > 1 else None)
             assert self._position_m is not None
             companions = self.cameras.companions(aim.camera, source, self._position_m, settled)
-            views = self.look((aim.camera, *companions), settled)
+            views = self.capture((aim.camera, *companions), settled)
             now = views.pop(aim.camera)
             with self.step("measure") as detail:
-                seen = self.cameras.look_for(clicked, now)
+                seen = self.cameras.find(clicked, now)
                 detail.update(camera=aim.camera, **match_facts(seen), predicted_px=rounded(seen.predicted_px))
                 detail.update(residual_px=rounded(seen.pixel_px - aim_px))
             confirmed: list[tuple[CameraView, PatchMatch]] = [(now, seen)]
@@ -284,14 +269,14 @@ class PointingLoop(Steps):
                 detail.update(confirmed_by=list(companions))
                 if views:
                     others = list(views.values())
-                    detail.update(check_one_moment(self.cameras, now, seen.pixel_px, others, settled))
+                    detail.update(self.cameras.check_one_moment(now, seen.pixel_px, others, settled))
                 for name, other in views.items():
-                    self.head.check_not_stopped()
+                    self.check_not_stopped()
                     same_pair = {aim.camera, name} == {source, self.cameras.partner(source)}
                     found, detail[name] = self.cameras.agree(clicked, now, seen, other, same_pair)
                     confirmed.append((other, found))
             later, again = self.repeated(clicked, now, seen, settled, aim_px)
-            self._done(self._measured(commanded, later, aim_px, again))
+            self._measured(commanded, later, aim_px, again)
             if number < pointings:
                 self._measure_again(confirmed)
 
@@ -317,15 +302,15 @@ class PointingLoop(Steps):
         self, aim: Aim, aim_px: FloatArray, resting: HeadReading | None
     ) -> tuple[Pair, HeadReading]:
         """Solve for the present position, move, settle; return the commanded readings and the arrival."""
-        start = resting or self.head.read()
+        start = resting or self.read()
         with self.step("solve") as detail:
-            best = self._chosen(aim, aim_px, start, detail)
+            best = self._solved(aim, aim_px, start, detail)
         self._range_m = best.range_m
         cameras = [name for name in (aim.camera, self.cameras.partner(aim.camera)) if name is not None]
         self.before(cameras, (best.pan_rad, best.tilt_rad), needed=(aim.camera,))
         return self.go_to_true(best.pan_rad, best.tilt_rad, aim.camera)
 
-    def _chosen(self, aim: Aim, aim_px: FloatArray, start: HeadReading, detail: dict[str, Any]) -> Solution:
+    def _solved(self, aim: Aim, aim_px: FloatArray, start: HeadReading, detail: dict[str, Any]) -> Solution:
         """Solve for the present position; return the solution that is taken from ``start``."""
         assert self._position_m is not None
         model = self._rig.cameras[aim.camera].model
@@ -334,47 +319,49 @@ class PointingLoop(Steps):
             self._rig.mast, model, self._position_m, aim_px, from_pan_rad=pan_rad, from_tilt_rad=tilt_rad
         )
         detail.update(solutions=[_facts(one) for one in solutions])
-        best = self.head.chosen(solutions, start)
+        best = self.chosen(solutions, start)
         detail.update(chosen=_facts(best))
         return best
 
     def _measured(
-        self, commanded: Pair, now: CameraView, aim_px: FloatArray, seen: PatchMatch | None
-    ) -> Pointing:
-        """Put together what one pointing did."""
+        self, commanded: Pair, now: CameraView, aim_px: FloatArray, seen: PatchMatch | None, **more: Any
+    ) -> None:
+        """Keep what one pointing did; the steps that follow belong to the next."""
         assert self._position_m is not None
         place, valid = now.camera.project(self._position_m)
         found: dict[str, Any] = {"note": NO_PICTURE_OF_A_POSITION}
         if seen is not None:
             found = {
-                "target_px": pair(seen.pixel_px),
-                "residual_px": pair(seen.pixel_px - aim_px),
-                "residual_sigma_px": pair(seen.sigma_px),
+                "target_px": seen.pixel_px.tolist(),
+                "residual_px": (seen.pixel_px - aim_px).tolist(),
+                "residual_sigma_px": seen.sigma_px.tolist(),
             }
-        return _pointing(
+        one = _pointing(
             commanded,
             now.frame,
             camera=now.frame.camera,
             frame_id=now.frame.frame_id,
-            aim_px=pair(aim_px),
-            predicted_px=pair(place) if bool(valid) else None,
+            aim_px=aim_px.tolist(),
+            predicted_px=place.tolist() if bool(valid) else None,
             motion_evidence=self.motion_evidence,
             **found,
+            **more,
         )
+        self._pointings.append(one)
+        self.pointing += 1
 
     def _so_far(self) -> PointingResult | None:
-        """Return the result with the pointings done, None without any."""
+        """The result with the pointings done, None without any."""
         if not self._pointings:
             return None
-        position = None if self._position_m is None else triple(self._position_m)
         one = self._one_camera
-        return PointingResult(
-            position,
-            self._range_m,
-            self._pointings,
-            self._range_from if one is None else one.range_from,
-            None if one is None else one.sight.range_interval_m,
-        )
+        return {
+            "position_m": None if self._position_m is None else self._position_m.tolist(),
+            "range_m": self._range_m,
+            "range_from": self._range_from if one is None else one.range_from,
+            "range_interval_m": None if one is None else list(one.sight.range_interval_m),
+            "pointings": self._pointings,
+        }
 
     def _stop(self) -> None:
         """Stop the mast whatever happened; what stops it must not hide why."""
@@ -394,5 +381,7 @@ def _facts(solution: Solution) -> dict[str, float]:
 
 
 def _pointing(commanded: Pair, at: HeadReading | StampedFrame, **more: Any) -> Pointing:
-    """Return a pointing with the head's angles as sent and as measured."""
-    return Pointing(*commanded, at.pan_rad, at.tilt_rad, *at.true_rad, **more)
+    """A pointing with the head's angles as sent and as measured."""
+    names = [f"{kind}_{axis}_rad" for kind in ("commanded", "measured", "true") for axis in ("pan", "tilt")]
+    angles = dict(zip(names, (*commanded, at.pan_rad, at.tilt_rad, *at.true_rad), strict=True))
+    return cast(Pointing, angles | NOT_MEASURED | more)

@@ -28,11 +28,10 @@ from calib.geometry.rigid import FloatArray
 from calib.matching.verdict import PatchMatch
 from calib.matching.warp import Plane, facing_plane
 from mastctl.devices.keep_out import Pair
-from mastctl.motion.requests import PointRequest
-from mastctl.motion.results import PointingError, rounded
+from mastctl.motion.measurement import CameraView, Clicked, rounded
+from mastctl.motion.requests import PointingError, PointRequest
 from mastctl.motion.settings import PointingSettings
 from mastctl.motion.steps import FoundAgain
-from mastctl.motion.views import CameraView, Clicked
 
 RangeFrom = Literal["given", "plane", "parallax", "unknown"]
 TRIED_SIGMAS = (1.0, -1.0, 2.0)

@@ -1,4 +1,4 @@
-"""What may be pointed at or followed, and a request judged before anything moves."""
+"""What may be pointed at or followed, a request judged before anything moves, and how one fails."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pydantic.dataclasses import dataclass
 
 from calib.geometry.rig import Rig
+from calib.geometry.rigid import Rigid
+from mastctl.answers import PointingResult
 from mastctl.control.entry import LONGEST_DEADLINE_S
 from mastctl.devices.frames import StampedFrame, check_known
-from mastctl.errors import BadRequest, NotNow
-from mastctl.motion.poses import RoverPose
+from mastctl.errors import BadRequest, MastctlError, NotNow
 
 CHECKED = ConfigDict(extra="forbid", allow_inf_nan=False)
 """Unknown keys and numbers that are not finite are refused, and by the types below what only looks right."""
@@ -29,6 +30,45 @@ Angle = Annotated[float, Field(strict=True, ge=-2 * math.pi, le=2 * math.pi)]
 Range = Annotated[float, Field(strict=True, ge=0.01, le=1e5)]
 Pointings = Annotated[int, Field(strict=True, ge=1, le=2)]
 DeadlineS = Annotated[float, Field(gt=0.0, le=LONGEST_DEADLINE_S, allow_inf_nan=False)]
+
+
+class PointingError(MastctlError):
+    """The request failed; the daemon stopped the mast.
+
+    The four verdicts of a search for the target that found none:
+
+    ``target_flat``: The image around the target has too little texture, or texture along one direction only.
+
+    ``target_ambiguous``: A second place in the image fits nearly as well as the target.
+
+    ``target_border``: The target lies at the border of an image or of the search window.
+
+    ``target_not_found``: No place in the search window fits the target: hidden, changed, or at another range.
+
+    Attributes
+    ----------
+    code
+        For programs. Own codes: ``stopped``, ``outside_image``, ``no_stereo``, ``head_fault``,
+        ``head_moving``, ``bad_reading``, ``no_fresh_frame``, ``did_not_arrive``, ``did_not_settle``,
+        ``not_in_view``, ``target_flat``, ``target_ambiguous``, ``target_border``, ``target_not_found``,
+        ``target_moving``, ``eyes_disagree``, ``off_the_line``, ``not_repeated``. That of a request that does
+        not fit, of a driver, of the limits or of the geometry passes through.
+    step
+        The step that failed.
+    result
+        The pointings done before it, None if there were none.
+    """
+
+    def __init__(self, code: str, message: str, step: str = "", result: PointingResult | None = None) -> None:
+        self.code = code
+        self.step = step
+        self.result = result
+        super().__init__(message)
+
+    @property
+    def detail(self) -> dict[str, str]:
+        """The failed step, for the error's detail."""
+        return {"step": self.step}
 
 
 class StrictBody(BaseModel):
@@ -96,11 +136,11 @@ class TrackRequest(StrictBody):
         if (self.pixel is None) == (self.position_m is None):
             raise ValueError("exactly one of pixel and position_m is expected")
 
-    def in_rover(self, pose: RoverPose | None) -> Self:
-        """Return it with a position of the site in the rover frame of a pose."""
-        if self.frame != "site" or pose is None:
+    def in_rover(self, site_from_rover: Rigid) -> Self:
+        """Return it with a position of the site in the rover frame."""
+        if self.frame != "site":
             return self
-        place = pose.site_from_rover.inverse.points(np.array(self.position_m)).tolist()
+        place = site_from_rover.inverse.points(np.array(self.position_m)).tolist()
         return self.model_copy(update={"position_m": place, "frame": "rover"})
 
 

@@ -1,7 +1,8 @@
-"""The steps that a pointing and a track's look have in common, each with its entry in the record."""
+"""The steps that a pointing and a track's look have in common: head and cameras, each step in the record."""
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -10,20 +11,35 @@ from typing import Any
 
 import numpy as np
 
+from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
+from calib.geometry.pointing import Solution, ordered
 from calib.matching.verdict import PatchMatch
 from drivers.clock import Clock
-from mastctl.devices.joint_history import HeadReading
-from mastctl.devices.keep_out import Pair
+from drivers.errors import DriverError
+from drivers.interfaces import AxisReport
+from mastctl.answers import Step
+from mastctl.devices.joint_history import HeadReading, RestWatch
+from mastctl.devices.keep_out import KeptOut, Pair
 from mastctl.devices.limits import Limits
 from mastctl.errors import NotNow
-from mastctl.motion.evidence import MotionSeen, apart, repeated
-from mastctl.motion.head import DevicesLike, SteeredHead
-from mastctl.motion.requests import PixelTarget, clicked_frame
-from mastctl.motion.results import Step, counts_left, rounded
+from mastctl.motion.measurement import (
+    CameraView,
+    Clicked,
+    DevicesLike,
+    RigCameras,
+    apart,
+    available,
+    match_facts,
+    rounded,
+)
+from mastctl.motion.requests import PixelTarget, PointingError, clicked_frame
 from mastctl.motion.settings import PointingSettings
-from mastctl.motion.views import CameraView, Clicked, RigCameras, match_facts
+
+WATCHED_S = 0.05
+"""How often a head at rest is read while a moment is waited for; a stop is noticed as soon."""
+REPEAT_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +70,11 @@ class FoundAgain:
 class Steps:
     """Head and cameras during one request.
 
+    A reading of the head must be finite, of now, not before the last one, and free of faults; it must be
+    reachable from the last one at twice the speed cap, or lie on the way to the commanded angles (a replayed
+    head is there at once). The head has settled when it rests (`RestWatch`); it has arrived when it rests
+    where it was sent.
+
     Parameters
     ----------
     rig
@@ -74,7 +95,7 @@ class Steps:
     pointing
         Which pointing of the request the next steps belong to; the record names the second and later ones.
     motion_evidence
-        What the last look's images say about the move before it, by camera (`MotionSeen`).
+        What the last images say about the move before them, by camera.
     """
 
     def __init__(
@@ -87,18 +108,19 @@ class Steps:
         record: Callable[[Step], None],
         cancelled: threading.Event,
     ) -> None:
-        self.head = SteeredHead(devices, limits, clock, settings, cancelled)
-        self.cameras = RigCameras(devices, rig, settings, self.head.check_not_stopped)
+        self.cameras = RigCameras(devices, rig, settings, self.check_not_stopped)
         self.last = "request"
         self.pointing = 1
         self.motion_evidence: Mapping[str, Mapping[str, Any]] = {}
-        self._motion_seen = MotionSeen(rig, settings.view)
         self._rig = rig
         self._devices = devices
         self._limits = limits
         self._clock = clock
         self._settings = settings
         self._record = record
+        self._cancelled = cancelled
+        self._last_reading: HeadReading | None = None
+        self._goal: Pair | None = None
 
     @contextmanager
     def step(self, name: str) -> Iterator[dict[str, Any]]:
@@ -108,23 +130,189 @@ class Steps:
         goes on.
         """
         self.last = name
-        started_s = self._clock.now_s()
+        began_s = self._clock.now_s()
         detail: dict[str, Any] = {"pointing": self.pointing} if self.pointing > 1 else {}
+        one = Step(name=name, state="failed", started_s=began_s, duration_s=0.0, detail=detail)
         try:
-            self.head.check_not_stopped()
+            self.check_not_stopped()
             yield detail
+            one["state"] = "done"
         except BaseException as error:
             detail.update(code=getattr(error, "code", "internal"), message=" ".join(str(error).split()))
-            self._record(Step(name, "failed", started_s, self._clock.now_s() - started_s, detail))
             raise
-        self._record(Step(name, "done", started_s, self._clock.now_s() - started_s, detail))
+        finally:
+            one["duration_s"] = self._clock.now_s() - began_s
+            self._record(one)
+
+    def check_not_stopped(self) -> None:
+        """Pass unless the request was cancelled. Raises PointingError ``stopped``."""
+        if self._cancelled.is_set():
+            raise PointingError("stopped", "the operation was stopped")
+
+    # The head
+
+    def read(self) -> HeadReading:
+        """Return a reading that can be true.
+
+        Raises PointingError ``bad_reading`` or ``head_fault``; DriverError if the head does not answer.
+        """
+        reading, before = self._devices.read(), self._last_reading
+        if self._clock.now_s() - reading.time_s > self._settings.reading_age_s:
+            reading = self._devices.read()  # a process without a processor meanwhile is no fault of the head
+        age_s = self._clock.now_s() - reading.time_s
+        if not all(map(math.isfinite, (reading.pan_rad, reading.tilt_rad, reading.time_s))):
+            message = f"the head reads pan {reading.pan_rad}, tilt {reading.tilt_rad}"
+            message += "" if math.isfinite(reading.time_s) else f" at {reading.time_s} s"
+            raise PointingError("bad_reading", f"{message}: not finite numbers")
+        if reading.faults:
+            raise PointingError("head_fault", f"the head reports: {'; '.join(reading.faults)}")
+        most_s = self._settings.reading_age_s
+        if age_s > most_s:
+            message = f"the head's reading is {age_s:.2f} s old, at most {most_s:g} s is taken"
+            raise PointingError("bad_reading", message)
+        if before is not None:
+            passed_s = reading.time_s - before.time_s
+            if passed_s < 0:
+                raise PointingError("bad_reading", f"the head's time went back by {-passed_s:.3f} s")
+            reach = 2.0 * self._limits.speed_rad_per_s * passed_s + self._settings.jump_rad
+            goal = self._goal or (before.pan_rad, before.tilt_rad)
+            jump = max(
+                _outside(reading.pan_rad, before.pan_rad, goal[0]),
+                _outside(reading.tilt_rad, before.tilt_rad, goal[1]),
+            )
+            if jump > reach:
+                message = f"the head's reading jumped {jump:.3f} rad off its way in {passed_s:.3f} s"
+                raise PointingError("bad_reading", f"{message}, at most {reach:.3f} rad is possible")
+        self._last_reading = reading
+        return reading
+
+    def resting(self) -> HeadReading:
+        """Return the reading of a head that rests now.
+
+        Raises PointingError ``head_moving`` if it still moves after ``rest_wait_s``; else as `read`.
+        """
+        watch = RestWatch(0.0, self._settings.rest_tolerance_rad)
+        settled, last = self._rests(watch, self._clock.now_s() + self._settings.rest_wait_s)
+        if not settled:
+            message = f"the head still moves after {self._settings.rest_wait_s:g} s of waiting"
+            raise PointingError("head_moving", f"{message}: {watch.seen()}")
+        return last
 
     def rest(self) -> HeadReading:
-        """Return the reading of a head that rests. Raises PointingError, DriverError."""
+        """Return the reading of a head that rests, as a step. Raises PointingError, DriverError."""
         with self.step("rest") as detail:
-            resting = self.head.resting()
+            resting = self.resting()
             detail.update(_angles(resting))
         return resting
+
+    def chosen(self, solutions: Sequence[Solution], start: HeadReading) -> Solution:
+        """Return the one of several true joint angles that is taken from a start, of the closed form.
+
+        Of those that no keep-out bars, upright ones first, then the nearest; an angle is taken whole turns
+        away too, where a cable lets the pan turn so far.
+
+        Raises Unreachable if none lies within the limits; KeptOut if keep-outs bar all that do; of the one
+        that would have been taken.
+        """
+
+        def goal(one: Solution) -> Pair:
+            return self._devices.goal((one.pan_rad, one.tilt_rad), start)
+
+        at = start.pan_rad, start.tilt_rad
+        refused: KeptOut | None = None
+        for one in ordered(solutions, self._limits.pan_rad, self._limits.tilt_rad, *at, goal):
+            try:
+                self._devices.check_from(at, goal(one))
+            except KeptOut as error:
+                refused = refused or error
+            else:
+                return one
+        assert refused is not None
+        raise refused
+
+    def go_to_true(self, pan_rad: float, tilt_rad: float, camera: str) -> tuple[Pair, HeadReading]:
+        """Go to true angles, as `go` does; return the readings that were commanded, and the arrival."""
+        goal = self._devices.goal((pan_rad, tilt_rad), self.read())
+        return goal, self.go(*goal, camera)
+
+    def go(self, pan_rad: float, tilt_rad: float, camera: str | None = None) -> HeadReading:
+        """Check the limits, move until the head reads the angles, wait until settled; return the reading.
+
+        Where the head knows its counts, the record says what these leave, in pixels of ``camera``.
+
+        Raises OutsideLimits, KeptOut, PointingError, Stopped, DriverError if the angles may not be commanded
+        or are not reached.
+        """
+        with self.step("limits") as detail:
+            detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad)
+            self.check_goal(pan_rad, tilt_rad)
+        with self.step("move") as detail:
+            allowed_s = self.time_allowed_s(pan_rad, tilt_rad)
+            detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad, allowed_s=round(allowed_s, 3))
+            began_s = self._clock.now_s()
+            self.send(pan_rad, tilt_rad)
+        with self.step("settle") as detail:
+            settled = self.arrived(pan_rad, tilt_rad, began_s + allowed_s)
+            model = None if camera is None else self._rig.cameras[camera].model
+            detail.update(_angles(settled), **counts_left(self._devices, settled.tilt_rad, model))
+            detail.update(count_rad=dict(self._devices.counts_rad))
+        return settled
+
+    def check_goal(self, pan_rad: float, tilt_rad: float) -> None:
+        """Pass angles to which the head may be sent from where it rests. Raises OutsideLimits, KeptOut."""
+        self._limits.check(pan_rad, tilt_rad)
+        now = self.read()
+        self._devices.check_from((now.pan_rad, now.tilt_rad), (pan_rad, tilt_rad))
+
+    def time_allowed_s(self, pan_rad: float, tilt_rad: float) -> float:
+        """Return the deadline of a move to these angles: distance over speed, ramps, dwell, margin."""
+        now, settings = self.read(), self._settings
+        distance = max(abs(pan_rad - now.pan_rad), abs(tilt_rad - now.tilt_rad))
+        rest_s = settings.acceleration_s + settings.dwell_s + settings.margin_s
+        return distance / self._limits.speed_rad_per_s + rest_s
+
+    def send(self, pan_rad: float, tilt_rad: float) -> None:
+        """Start the move at the speed cap. Raises OutsideLimits, Stopped, DriverError."""
+        self.check_not_stopped()
+        self._goal = (pan_rad, tilt_rad)
+        self._devices.move(pan_rad, tilt_rad)
+
+    def arrived(self, pan_rad: float, tilt_rad: float, deadline_s: float) -> HeadReading:
+        """Wait until the head rests at these angles and return the reading.
+
+        Raises PointingError ``did_not_arrive`` with how far it is off, ``did_not_settle`` if it never rests
+        before the deadline (clock time, seconds), ``stopped``; else as `read`.
+        """
+        tolerance = self._settings.arrival_tolerance_rad
+        watch = RestWatch(self._settings.dwell_s, self._settings.rest_tolerance_rad)
+        while True:
+            settled, last = self._rests(watch, deadline_s)
+            off = last.pan_rad - pan_rad, last.tilt_rad - tilt_rad
+            if settled and max(map(abs, off)) <= tolerance:
+                return last
+            if self._clock.now_s() < deadline_s:
+                self._clock.sleep(self._settings.poll_s)
+                continue  # a head that rests elsewhere may not have started yet
+            where = f"pan {off[0]:+.4f} rad and tilt {off[1]:+.4f} rad from the commanded angles"
+            if max(map(abs, off)) > tolerance:
+                message = f"at its deadline the head is {where}, at most {tolerance:g} rad is expected"
+                raise PointingError("did_not_arrive", message)
+            raise PointingError(
+                "did_not_settle", f"at its deadline the head still moves, {where}: {watch.seen()}"
+            )
+
+    def _rests(self, watch: RestWatch, deadline_s: float) -> tuple[bool, HeadReading]:
+        """Read until the head rests (True) or the deadline passes; return the last reading."""
+        while True:
+            self.check_not_stopped()
+            reading = self.read()
+            if watch.rests(reading):
+                return True, reading
+            if self._clock.now_s() >= deadline_s:
+                return False, reading
+            self._clock.sleep(self._settings.poll_s)
+
+    # The cameras
 
     def clicked(self, target: PixelTarget, alone: bool = False) -> FoundAgain:
         """Take a fresh pair, or the clicked camera's image ``alone``, and find in it what was clicked.
@@ -142,7 +330,7 @@ class Steps:
             now, other = fresh[target.camera], None if partner is None else fresh[partner]
             detail.update(frame_ids=[fresh[name].frame.frame_id for name in cameras])
             detail.update(apart(now, [] if other is None else [other]))
-            self._motion_seen.remember(fresh)
+            self.cameras.remember(fresh)
             if view.frame.mast_digest != now.frame.mast_digest:
                 message = f"frame {target.frame_id} was taken with another mast file"
                 raise NotNow("other_mast_file", message)
@@ -150,35 +338,6 @@ class Steps:
             again = self.cameras.again(view, pixel, now)
             detail.update(match_facts(again))
         return FoundAgain(view, pixel, now, other, again.pixel_px, float(again.sigma_px.max()), resting)
-
-    def go_to_true(self, pan_rad: float, tilt_rad: float, camera: str) -> tuple[Pair, HeadReading]:
-        """Go to true angles, as `go` does; return the readings that were commanded, and the arrival."""
-        goal = self._devices.goal((pan_rad, tilt_rad), self.head.read())
-        return goal, self.go(*goal, camera)
-
-    def go(self, pan_rad: float, tilt_rad: float, camera: str | None = None) -> HeadReading:
-        """Check the limits, move until the head reads the angles, wait until settled; return the reading.
-
-        Where the head knows its counts, the record says what these leave, in pixels of ``camera``.
-
-        Raises OutsideLimits, KeptOut, PointingError, Stopped, DriverError if the angles may not be commanded
-        or are not reached.
-        """
-        with self.step("limits") as detail:
-            detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad)
-            self._limits.check(pan_rad, tilt_rad)
-            self.head.check_goal(pan_rad, tilt_rad)
-        with self.step("move") as detail:
-            allowed_s = self.head.time_allowed_s(pan_rad, tilt_rad)
-            detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad, allowed_s=round(allowed_s, 3))
-            begun_s = self._clock.now_s()
-            self.head.send(pan_rad, tilt_rad)
-        with self.step("settle") as detail:
-            settled = self.head.arrived(pan_rad, tilt_rad, begun_s + allowed_s)
-            model = None if camera is None else self._rig.cameras[camera].model
-            detail.update(_angles(settled), **counts_left(self._devices, settled.tilt_rad, model))
-            detail.update(count_rad=dict(self._devices.counts_rad))
-        return settled
 
     def before(
         self,
@@ -195,21 +354,21 @@ class Steps:
         Raises PointingError, DriverError if a needed one gives none, or the head does not answer; nothing has
         moved.
         """
-        configured = self._devices.newest_frames()
-        known = [name for name in cameras if name in configured]
-        lacking = self._motion_seen.lacking(known, self.head.read().true_rad, goal_rad)
+        lacking = self.cameras.lacking(cameras, self.read().true_rad, goal_rad)
         if not lacking:
             return
         with self.step("before") as detail:
-            began_s, resting = self._clock.now_s(), self.head.resting()
-            views, missing = self.cameras.some(lacking, began_s, resting, needed, timeout_s)
+            began_s, resting = self._clock.now_s(), self.resting()
+            views, missing = available(
+                lacking, lambda left: self.cameras.new(left, began_s, resting, timeout_s), needed
+            )
             if views:
                 detail.update(frame_ids=[view.frame.frame_id for view in views.values()])
-                self._motion_seen.remember(views)
+                self.cameras.remember(views)
             if missing:
                 detail.update(missing=missing)
 
-    def look(self, cameras: Sequence[str], settled: HeadReading) -> dict[str, CameraView]:
+    def capture(self, cameras: Sequence[str], settled: HeadReading) -> dict[str, CameraView]:
         """Take new images, exposed after the head had settled, that moved as the head did.
 
         Raises PointingError, DriverError if none come; `BadFrame` if one shows another view than the joints
@@ -219,27 +378,102 @@ class Steps:
             views = self.cameras.new(cameras, settled.time_s, settled)
             first, *others = views.values()
             detail.update(frame_ids=[view.frame.frame_id for view in views.values()], **apart(first, others))
-            self._motion_seen.check(views, detail)
+            self.cameras.check_motion(views, detail)
             self.motion_evidence = detail["motion_evidence"]
         return views
 
     def repeated(
         self, clicked: Clicked, first: CameraView, seen: PatchMatch, settled: HeadReading, aim_px: FloatArray
     ) -> tuple[CameraView, PatchMatch]:
-        """Measure once more in a later image (`mastctl.motion.evidence.repeated`); return what counts.
+        """Find the clicked thing in a later image of the same camera, where the first one showed it.
 
-        That is what the later image shows; the first one's, if the settings want no second.
+        ``first`` and ``seen`` are the first image after the move, and where that shows it; ``settled`` is the
+        head when it had come to rest. Returns the later image and where that shows it; the first one's, if
+        the settings want no second. The record gets ``repeated_after_s``, ``apart_px`` (x, y) and
+        ``fresh_to_s``: images older than their stamps by up to that, seconds, would not have passed. 0 where
+        both are the same to the last bit, as of a camera that froze or of a replay.
+
+        Raises PointingError ``not_repeated`` if it is elsewhere by more than three sigma and what the joints
+        read between the two (a head at rest may dither by some counts), or not found; DriverError if the
+        image does not come.
         """
         if not self._settings.repeat_after_s:
             return first, seen
+        camera, began_s = first.frame.camera, first.frame.exposure_began_s
         with self.step("repeat") as detail:
-            self.head.watch_until(first.frame.exposure_began_s + self._settings.repeat_after_s)
-            later, again, proven = repeated(self.cameras, clicked, first, seen, settled)
-            name = first.frame.camera
-            detail.update(camera=name, frame_ids=[later.frame.frame_id], **match_facts(again))
+            until_s = began_s + self._settings.repeat_after_s
+            while (left_s := until_s - self._clock.now_s()) > 0.0:
+                self.check_not_stopped()
+                self.read()
+                self._clock.sleep(min(left_s, WATCHED_S))
+            later = self.cameras.new((camera,), until_s, settled)[camera]
+            after_s = later.frame.exposure_began_s - began_s
+            try:
+                again = self.cameras.find(clicked, later)
+            except PointingError as error:
+                message = f"{after_s:.2f} s later {camera} does not see the target any more: {error}"
+                raise PointingError("not_repeated", message) from None
+            apart_px = again.pixel_px - seen.pixel_px
+            before_px, after_px = (view.camera.project(clicked.plane.point_m)[0] for view in (first, later))
+            sigma_px = np.hypot(seen.sigma_px, again.sigma_px)
+            allowed_px = REPEAT_SIGMAS * sigma_px + np.abs(after_px - before_px)
+            if (np.abs(apart_px) > allowed_px).any():
+                raise PointingError(
+                    "not_repeated",
+                    f"{after_s:.2f} s later {camera} shows the target {apart_px[0]:+.2f}, {apart_px[1]:+.2f} "
+                    f"px elsewhere, at most {allowed_px[0]:.2f}, {allowed_px[1]:.2f} px (3 sigma) is "
+                    "expected of a head at rest. The pictures are older than their stamps ('mastctl camera "
+                    "sync' measures by how much), the mast still rings, or the target or the rover moves",
+                )
+            another = not np.array_equal(first.image, later.image)
+            proven = {
+                "repeated_after_s": round(after_s, 3),
+                "apart_px": rounded(apart_px),
+                "fresh_to_s": round(later.frame.exposure_began_s - settled.time_s, 3) if another else 0.0,
+            }
+            detail.update(camera=camera, frame_ids=[later.frame.frame_id], **match_facts(again))
             detail.update(residual_px=rounded(again.pixel_px - aim_px), **proven)
-            self.motion_evidence = {**self.motion_evidence, name: {**self.motion_evidence[name], **proven}}
+            evidence = self.motion_evidence
+            self.motion_evidence = {**evidence, camera: {**evidence[camera], **proven}}
         return later, again
+
+
+def counts_left(devices: object, tilt_rad: float, model: CameraModel | None) -> dict[str, Any]:
+    """Return ``counts``: goal, measured count and what is left between both, by axis.
+
+    A head that fails to answer has ``counts_missing`` instead, which says why; one without ``report`` (see
+    `drivers.interfaces.PanTilt`) nothing.
+
+    ``tilt_rad``: where the head is: a pan turns the image of a head that looks up less; ``model``: the aiming
+    camera, for the pixels; None for joint angles alone.
+    """
+    report = getattr(devices, "report", None)
+    try:
+        axes: dict[str, AxisReport] = dict(report()) if report is not None else {}
+    except DriverError as error:
+        return {"counts_missing": str(error)}
+    counts: dict[str, dict[str, Any]] = {}
+    for name, axis in axes.items():
+        one: dict[str, Any] = {"goal_counts": axis.goal_counts, "measured_counts": axis.measured_counts}
+        counts[name] = one
+        one["came_from"] = axis.side
+        if axis.count_rad is not None:
+            one["count_rad"] = axis.count_rad
+        if axis.left_rad is None:
+            continue
+        one["left_rad"] = round(axis.left_rad, 7)
+        if model is not None:
+            # Yakimovsky and Cunningham (1978): the focal lengths of columns and rows
+            focal_px = model.focal_px[0 if name == "pan" else 1]
+            share = math.cos(tilt_rad) if name == "pan" else 1.0
+            left_px = axis.left_px(focal_px)
+            one["left_px"] = None if left_px is None else round(share * left_px, 3)
+    return {"counts": counts} if counts else {}
+
+
+def _outside(value: float, one: float, other: float) -> float:
+    """How far a value lies outside the range between two others."""
+    return max(min(one, other) - value, value - max(one, other), 0.0)
 
 
 def _angles(reading: HeadReading) -> dict[str, float]:

@@ -33,7 +33,7 @@ from mastctl.answers import (
     LeaseTold,
     MastTold,
     OperationTold,
-    PointingTold,
+    Pointing,
     StateTold,
     TrackTold,
 )
@@ -64,7 +64,7 @@ class RecordedTarget(TypedDict):
     range_m: float | None
 
 
-class ResidualRecord(PointingTold):
+class ResidualRecord(Pointing):
     """A pointing that measured a residual."""
 
     operation: str

@@ -39,11 +39,9 @@ from mastctl.devices.frames import OPERATIONS, StampedFrame, check_known, random
 from mastctl.devices.opening import open_rig
 from mastctl.errors import MastctlError
 from mastctl.motion.jog import Jogs
-from mastctl.motion.pairs import in_picture
-from mastctl.motion.poses import RoverPose
 from mastctl.motion.requests import wrong_camera
-from mastctl.motion.track import ACTIVE, TrackStatus
-from mastctl.motion.tracker import Tracker
+from mastctl.motion.search import in_picture
+from mastctl.motion.track import ACTIVE, RoverPose, Tracker, TrackStatus
 from mastctl.recorder.entries import AttachedMast
 from mastctl.recorder.recorder import Recorder
 from mastctl.recorder.writer import Attached

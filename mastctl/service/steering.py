@@ -6,11 +6,11 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 from calib.geometry.rig import Rig
 from drivers.clock import Clock
-from mastctl.answers import PreviewTold
+from mastctl.answers import Preview
 from mastctl.control.operations import OperationRunner
 from mastctl.control.records import Operation
 from mastctl.devices.devices import Devices
@@ -18,7 +18,6 @@ from mastctl.devices.frames import check_known
 from mastctl.devices.limits import Limits
 from mastctl.errors import NotNow
 from mastctl.motion.loop import PointingLoop
-from mastctl.motion.poses import RoverPose
 from mastctl.motion.requests import (
     PixelTarget,
     PointRequest,
@@ -28,10 +27,11 @@ from mastctl.motion.requests import (
     clicked_frame,
 )
 from mastctl.motion.settings import PointingSettings
-from mastctl.motion.track import ACTIVE
-from mastctl.motion.tracker import Tracker
+from mastctl.motion.track import ACTIVE, RoverPose, Tracker
 from mastctl.service.masts import Masts
 from mastctl.watch.residuals import CalibrationHealth
+
+R = TypeVar("R", bound=TrackRequest)
 
 LOOKS_S = 120.0  # a pointing's images, each of which may be waited for
 MARGIN_S = 15.0
@@ -98,7 +98,7 @@ class Steering:
         `mastctl.control.operations.OperationRunner.start`.
         """
         with self._masts.unchanged() as mast:
-            request = request.in_rover(self._tracker.pose)
+            request = self._in_rover(request)
             self._check(request)
             loop = self._loop()
 
@@ -108,7 +108,7 @@ class Steering:
 
             return self._operations.start(recorded, run, partial(self._health.ended, mast.stored))
 
-    def preview(self, request: PointRequest, cancelled: threading.Event) -> PreviewTold:
+    def preview(self, request: PointRequest, cancelled: threading.Event) -> Preview:
         """Return what a pixel of a named frame shows and where the head would go; nothing moves.
 
         Raises as `point` and `mastctl.motion.loop.PointingLoop.preview`.
@@ -124,7 +124,7 @@ class Steering:
         Raises as `point`; NotNow ``busy`` also while a track runs.
         """
         with self._masts.unchanged():
-            request = request.in_rover(self._tracker.pose)
+            request = self._in_rover(request)
             if request.pixel is not None:
                 check_known(request.pixel.camera, self._rig.cameras)
                 check_pair(request.pixel.camera, self._rig, self._masts.in_use.stored.rig)
@@ -134,7 +134,7 @@ class Steering:
     def look(self) -> Operation:
         """Look for the track's target once more and return the look's first record.
 
-        Raises as `mastctl.motion.tracker.Tracker.look`.
+        Raises as `mastctl.motion.track.Tracker.look`.
         """
         with self._masts.unchanged():
             return self._tracker.look()
@@ -142,7 +142,7 @@ class Steering:
     def take_pose(self, pose: RoverPose, look: bool) -> str | None:
         """Take the rover's pose; return the id of the look that follows, if one does.
 
-        Raises as `mastctl.motion.tracker.Tracker.take_pose`.
+        Raises as `mastctl.motion.track.Tracker.take_pose`.
         """
         if look:
             self._operations.let_stopped_end()
@@ -162,6 +162,11 @@ class Steering:
         """Return what makes a pointing by the mast file and the limits of now."""
         limits = self._devices.judge.limits
         return partial(PointingLoop, self._rig, self._devices, limits, self._clock, self._settings)
+
+    def _in_rover(self, request: R) -> R:
+        """Return a request in the rover frame of now; before a pose, site and rover are one."""
+        pose = self._tracker.pose
+        return request if pose is None else request.in_rover(pose.site_from_rover)
 
     def _check(self, request: PointRequest) -> None:
         """Refuse a request that does not fit the mast file in use; see `point`."""

@@ -17,7 +17,7 @@ from mastctl.control.operations import STOP_ASKED, OperationRunner
 from mastctl.control.standing import Latched, StandingFault, latched_sentence
 from mastctl.devices.devices import Devices
 from mastctl.errors import MastctlError, NotNow, Unable
-from mastctl.motion.tracker import Tracker
+from mastctl.motion.track import Tracker
 from mastctl.safety.latch import Estopped, Latch
 from mastctl.safety.state_folder import StateFolder
 from mastctl.safety.stop_socket import StopHandlers

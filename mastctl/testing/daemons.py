@@ -21,7 +21,7 @@ from mastctl.config import Config, Listen, load_config, not_simulated
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.frames import camera_and_sequence
 from mastctl.errors import NotKnown, NotNow
-from mastctl.motion.poses import RoverPose
+from mastctl.motion.track import RoverPose
 
 USUAL = {"samples": 1, "speed": "max"}
 

@@ -65,7 +65,7 @@ def measured_by(operation: Operation, mast: StoredRig, time_s: float) -> Measure
         return None
     source, rig = str(pixel.get("camera")), mast.rig
     partners = [a if source == b else b for a, b in rig.stereo.values() if source in (a, b)]
-    steps = {step.name: step.detail for step in reversed(operation.steps)}  # the first of each name
+    steps = {step["name"]: step["detail"] for step in reversed(operation.steps)}  # the first of each name
     try:
         rest, seen, settled, found = (steps[name] for name in ("rest", "triangulate", "settle", "measure"))
         found = steps.get("repeat", found)

@@ -19,7 +19,7 @@ from mastctl.answers import (
     Operations,
     OperationTold,
     PoseTaken,
-    PreviewTold,
+    Preview,
     ResetTold,
     Started,
     Status,
@@ -52,8 +52,7 @@ from mastctl.control.standing import Latched
 from mastctl.errors import BadRequest, NotNow, Unable, one_line
 from mastctl.http import PREFIX
 from mastctl.motion.jog import JogBeat
-from mastctl.motion.requests import PointRequest, TrackRequest
-from mastctl.motion.results import PointingError
+from mastctl.motion.requests import PointingError, PointRequest, TrackRequest
 from mastctl.safety.latch import LONGEST
 from mastctl.safety.stop_socket import StopsHang
 from mastctl.service.service import Service
@@ -94,14 +93,14 @@ def add_pointing(app: FastAPI) -> None:
         return {"id": here.service.steering.point(body, body.model_dump(exclude_none=True)).id}
 
     @app.post(f"{PREFIX}/point/preview", summary="The point at a pixel, before anything moves")
-    async def preview(body: PointRequest, here: Here) -> PreviewTold:
+    async def preview(body: PointRequest, here: Here) -> Preview:
         service = here.service
         if body.pixel is None:
             raise BadRequest("bad_request", "pixel is missing; a preview is of a pixel of a named frame")
         service.check_camera(body.pixel.camera)
         cancelled = threading.Event()
         try:
-            seen: PreviewTold = await here.waiting.image(
+            seen: Preview = await here.waiting.image(
                 body.pixel.camera, lambda: service.steering.preview(body, cancelled)
             )
         except PointingError as error:

@@ -29,7 +29,7 @@ from calib.matching.track import Track, moved_track, start_track
 from drivers.sim.scene import SceneSettings, build_scene
 from mastctl.cli.tasks import results_of
 from mastctl.experiment.targets import texture_mask
-from mastctl.motion.pairs import choose_pairs
+from mastctl.motion.search import choose_pairs
 from mastctl.packaged import config_folder
 from tools.command import end, options, show
 from tools.studies.approach_world import ApproachWorld, WorldErrors

@@ -25,7 +25,7 @@ from calib.matching.warp import PosedImage, grey
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.experiment.pointing import ClickTruth
 from mastctl.experiment.targets import VIEWS_PER_TARGET, Target, TargetViews
-from mastctl.motion.pairs import JOINT_SIGMA_RAD
+from mastctl.motion.search import JOINT_SIGMA_RAD
 
 STEPS: tuple[tuple[str, str, float], ...] = (("pancam", "navcam", 6.0), ("navcam", "hazcam", 2.0))
 """The paper's hand-offs: from, to, distance in metres."""

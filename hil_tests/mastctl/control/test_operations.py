@@ -10,7 +10,7 @@ import pytest
 
 from drivers.clock import ManualClock
 from drivers.errors import NoReply
-from hil_tests.mastctl.service_fakes import FakePointing, FakeResult
+from hil_tests.mastctl.service_fakes import fake_result
 from hil_tests.waiting import NET_S, joined, present, until
 from mastctl.control.machine import StateMachine
 from mastctl.control.operations import KEPT_OPERATIONS, STOP_ASKED, OperationRunner
@@ -71,9 +71,9 @@ def until_cancelled(record: Callable[[Any], None], cancelled: threading.Event) -
     raise Stopped("cancelled")
 
 
-def pointed(*residuals: Any) -> FakeResult:
+def pointed(*residuals: Any) -> dict[str, Any]:
     """A result with a pointing for each residual."""
-    return FakeResult([1.0, 2.0, 3.0], 3.7, tuple(FakePointing(one, [0.1, 0.2], "") for one in residuals))
+    return fake_result([1.0, 2.0, 3.0], 3.7, *residuals)
 
 
 def test_a_stop_blocks_and_halts_before_it_ends_what_runs(

@@ -27,7 +27,7 @@ from mastctl.errors import (
     Unable,
 )
 from mastctl.http.refusals import status_of
-from mastctl.motion.results import PointingError
+from mastctl.motion.requests import PointingError
 from tools.page_tables import page_text
 
 KINDS = (BadRequest, NotAllowed, NotKnown, NotLetIn, NoLonger, NotNow, Unable)

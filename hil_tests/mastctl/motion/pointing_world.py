@@ -20,6 +20,7 @@ from calib.geometry.rig import Mast, Rig, RigCamera
 from drivers.clock import ManualClock
 from drivers.interfaces import Reading
 from hil_tests.calib.matching.textured_planes import Edge, Pinhole, TexturedPlane, picture, random_texture
+from mastctl.answers import PointingResult, Step
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.keep_out import Pair
@@ -27,7 +28,6 @@ from mastctl.devices.limits import Limits
 from mastctl.errors import NotKnown
 from mastctl.motion.loop import PointingLoop
 from mastctl.motion.requests import PixelTarget, PointRequest
-from mastctl.motion.results import PointingResult, Step
 from mastctl.motion.settings import PointingSettings
 
 SIZE_PX = (300, 240)

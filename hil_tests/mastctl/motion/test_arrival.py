@@ -6,18 +6,20 @@ import math
 import threading
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from calib.geometry.pointing import Solution
 from drivers.clock import ManualClock
 from drivers.interfaces import Reading
+from hil_tests.mastctl.motion.pointing_world import rig
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.keep_out import KeptOut
 from mastctl.devices.limits import Limits
-from mastctl.motion.head import SteeredHead, reached
-from mastctl.motion.results import PointingError
+from mastctl.motion.requests import PointingError
 from mastctl.motion.settings import PointingSettings
+from mastctl.motion.steps import Steps
 
 SPEED_RAD_PER_S = 0.5
 SETTINGS = PointingSettings(
@@ -44,12 +46,17 @@ class Turning:
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         self.moves.append((pan_rad, tilt_rad))
 
+    def goal(self, true_rad: tuple[float, float], start: HeadReading) -> tuple[float, float]:
+        return true_rad
+
+    def check_from(self, start: tuple[float, float], goal: tuple[float, float]) -> None: ...
     def stop(self) -> None: ...
 
 
-def request(turning: Turning, cancelled: threading.Event | None = None) -> SteeredHead:
-    limits = Limits((-2.0, 2.0), (-1.0, 1.0), SPEED_RAD_PER_S)
-    return SteeredHead(turning, limits, turning.clock, SETTINGS, cancelled or threading.Event())  # type: ignore[arg-type]
+def request(turning: Turning, cancelled: threading.Event | None = None) -> Steps:
+    limits, stopped = Limits((-2.0, 2.0), (-1.0, 1.0), SPEED_RAD_PER_S), cancelled or threading.Event()
+    steps: list[Any] = []
+    return Steps(rig(), turning, limits, turning.clock, SETTINGS, steps.append, stopped)  # type: ignore[arg-type]
 
 
 def standing(pan_rad: float = 0.3, tilt_rad: float = -0.2) -> Turning:
@@ -197,9 +204,11 @@ def test_the_nearest_solution_that_no_keep_out_bars_is_taken() -> None:
         if goal[0] in barred:
             raise KeptOut("deck", f"pan {goal[0]} is kept out")
 
+    turning = standing(0.0, 0.0)
+    turning.check_from = check_from  # type: ignore[method-assign, assignment]
+
     def taken() -> Solution:
-        limits = Limits((-2.0, 2.0), (-1.0, 1.0), SPEED_RAD_PER_S)
-        return reached([far, near], limits, check_from, (0.0, 0.0), lambda one: (one.pan_rad, one.tilt_rad))
+        return request(turning).chosen([far, near], turning.read())
 
     assert taken() == near
     barred.add(near.pan_rad)

@@ -20,9 +20,9 @@ from drivers.sim.scene import Scene, SceneSettings, build_scene
 from hil_tests.support.sim_survey.board import photograph
 from mastctl.devices.frames import StampedFrame
 from mastctl.experiment.targets import texture_mask
-from mastctl.motion.results import PointingError
+from mastctl.motion.measurement import CameraView, RigCameras
+from mastctl.motion.requests import PointingError
 from mastctl.motion.settings import PointingSettings
-from mastctl.motion.views import CameraView, RigCameras
 from mastctl.packaged import config_folder
 
 TARGETS, SEEDS, RELIEF_M = 8, (1, 2), 0.5

@@ -18,10 +18,10 @@ import pytest
 from calib.matching.shown_view import Posed, shown_view
 from drivers.errors import NoReply
 from hil_tests.mastctl.motion.pointing_world import SIZE_PX, World, clean, click, moving_world, rig, run
+from mastctl.answers import PointingResult
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
-from mastctl.motion.requests import Aim, PointRequest
-from mastctl.motion.results import PointingError, PointingResult
+from mastctl.motion.requests import Aim, PointingError, PointRequest
 from mastctl.motion.settings import PointingSettings
 
 MIDDLE_PX = (np.array(SIZE_PX) - 1) / 2
@@ -90,12 +90,12 @@ def test_an_honest_world_is_seen_to_move(clicked_px: tuple[float, float]) -> Non
     frame = world.shoot()
     point = world.true_point(frame, *clicked_px)
     result, _ = run(world, click(frame, *clicked_px, pointings=2))
-    for pointing, verdicts in zip(result.pointings, ({"seen", "small_move"}, {"small_move"}), strict=True):
-        assert pointing.residual_px is not None
-        truth = world.true_pixel(pointing.frame_id, point) - MIDDLE_PX
-        assert np.abs(np.array(pointing.residual_px) - truth).max() < TRUE_PX
-        assert set(pointing.motion_evidence) == {"navcam_left", "navcam_right"}
-        for told in pointing.motion_evidence.values():
+    for pointing, verdicts in zip(result["pointings"], ({"seen", "small_move"}, {"small_move"}), strict=True):
+        assert pointing["residual_px"] is not None
+        truth = world.true_pixel(pointing["frame_id"], point) - MIDDLE_PX
+        assert np.abs(np.array(pointing["residual_px"]) - truth).max() < TRUE_PX
+        assert set(pointing["motion_evidence"]) == {"navcam_left", "navcam_right"}
+        for told in pointing["motion_evidence"].values():
             assert told["verdict"] in verdicts
             assert np.abs(told["off_rad"]).max() < 1e-3
 
@@ -120,23 +120,25 @@ def test_pictures_older_than_their_stamps_give_no_false_residual(
         assert error.code in ("bad_frame", "not_repeated"), str(error)
         assert late_s > 0.15, "the head was at rest for so long: nothing was wrong"
         result = error.result
-    for pointing in () if result is None else result.pointings:
-        assert pointing.residual_px is not None
-        truth = world.true_pixel(pointing.frame_id, point) - MIDDLE_PX  # where the head stood by the stamp
-        assert np.abs(np.array(pointing.residual_px) - truth).max() < TRUE_PX
+    for pointing in () if result is None else result["pointings"]:
+        assert pointing["residual_px"] is not None
+        truth = world.true_pixel(pointing["frame_id"], point) - MIDDLE_PX  # where the head stood by the stamp
+        assert np.abs(np.array(pointing["residual_px"]) - truth).max() < TRUE_PX
 
 
 def test_a_residual_is_told_with_how_old_the_pictures_behind_it_may_be() -> None:
     world = World()
     result, steps = run(world, click(world.shoot(), *CLICK_PX))
-    told = result.pointings[0].motion_evidence["navcam_left"]
+    told = result["pointings"][0]["motion_evidence"]["navcam_left"]
     assert told["repeated_after_s"] >= 1.0 and np.abs(told["apart_px"]).max() < 0.2
-    settled = next(step for step in steps if step.name == "settle")
-    began_s = world.frame_by_id(result.pointings[0].frame_id).exposure_began_s
-    assert told["fresh_to_s"] == pytest.approx(began_s - settled.started_s - settled.duration_s, abs=0.01)
+    settled = next(step for step in steps if step["name"] == "settle")
+    began_s = world.frame_by_id(result["pointings"][0]["frame_id"]).exposure_began_s
+    assert told["fresh_to_s"] == pytest.approx(
+        began_s - settled["started_s"] - settled["duration_s"], abs=0.01
+    )
     once, steps = run(world, click(world.shoot(), *CLICK_PX), settings=PointingSettings(repeat_after_s=0.0))
-    assert "repeat" not in [step.name for step in steps]
-    assert "fresh_to_s" not in once.pointings[0].motion_evidence["navcam_left"]
+    assert "repeat" not in [step["name"] for step in steps]
+    assert "fresh_to_s" not in once["pointings"][0]["motion_evidence"]["navcam_left"]
 
 
 def test_a_target_or_a_rover_that_moves_is_told_as_that() -> None:
@@ -169,10 +171,10 @@ def test_a_head_that_dithers_by_a_count_repeats_what_it_shows() -> None:
     frame = world.shoot()
     point = world.true_point(frame, *CLICK_PX)
     between_the_pictures(world, lambda: world.place(world.moves[0][0] + count_rad, world.moves[0][1]))
-    (pointing,) = run(world, click(frame, *CLICK_PX))[0].pointings
-    assert pointing.residual_px is not None
-    truth = world.true_pixel(pointing.frame_id, point) - MIDDLE_PX
-    assert abs(truth[0]) > 0.8 and np.abs(np.array(pointing.residual_px) - truth).max() < TRUE_PX
+    (pointing,) = run(world, click(frame, *CLICK_PX))[0]["pointings"]
+    assert pointing["residual_px"] is not None
+    truth = world.true_pixel(pointing["frame_id"], point) - MIDDLE_PX
+    assert abs(truth[0]) > 0.8 and np.abs(np.array(pointing["residual_px"]) - truth).max() < TRUE_PX
 
 
 @pytest.mark.parametrize("during", ["the head is watched", "the picture is waited for"])
@@ -240,7 +242,7 @@ def test_a_pattern_that_repeats_with_the_move_is_said_to_be_too_plain() -> None:
     pattern = np.tile(np.kron(tile, np.ones((4, 4), np.uint8)), (10, 13))[: SIZE_PX[1], : SIZE_PX[0]]
     world.image = lambda camera, number, image: pattern.copy()
     result, _ = run(world, PointRequest(position_m=[4.0, 0.02, 0.0]))
-    assert result.pointings[0].motion_evidence["navcam_left"]["verdict"] == "too_plain"
+    assert result["pointings"][0]["motion_evidence"]["navcam_left"]["verdict"] == "too_plain"
 
 
 def test_the_aiming_pair_looks_before_the_move_where_that_is_of_use() -> None:
@@ -248,8 +250,8 @@ def test_the_aiming_pair_looks_before_the_move_where_that_is_of_use() -> None:
     clicked = world.shoot("navcam_left")
     aim = Aim("pancam_left", *MIDDLE_PX)
     result, steps = run(world, click(clicked, 160.0, 130.0, aim=aim))
-    assert [step.name for step in steps].count("before") == 1
-    assert result.pointings[0].motion_evidence["pancam_left"]["verdict"] in ("seen", "small_move")
+    assert [step["name"] for step in steps].count("before") == 1
+    assert result["pointings"][0]["motion_evidence"]["pancam_left"]["verdict"] in ("seen", "small_move")
     world = World()
     buffered(world)
     error = refusal(world, click(world.shoot("navcam_left"), 120.0, 100.0, aim=aim))

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from hil_tests.mastctl.motion.pointing_world import LATE_S, World, click, moving_world, rig, run
-from mastctl.motion.evidence import check_one_moment
-from mastctl.motion.results import PointingError, Step
+from mastctl.answers import Step
+from mastctl.motion.measurement import RigCameras
+from mastctl.motion.requests import PointingError
 from mastctl.motion.settings import PointingSettings
-from mastctl.motion.views import RigCameras
 
 
 def detail(steps: list[Step], name: str) -> dict[str, object]:
-    return dict(next(step.detail for step in steps if step.name == name))
+    return dict(next(step["detail"] for step in steps if step["name"] == name))
 
 
 def test_eyes_that_expose_apart_measure_what_stands_still() -> None:
@@ -23,7 +23,7 @@ def test_eyes_that_expose_apart_measure_what_stands_still() -> None:
         found = detail(steps, name)
         assert found["dt_s"] == {"navcam_right": pytest.approx(LATE_S)}
         assert found["image_speed_px_per_s"] < 2.0  # type: ignore[operator]  # of the noise: 0.1 px in 0.1 s
-    residual_px = result.pointings[0].residual_px
+    residual_px = result["pointings"][0]["residual_px"]
     assert residual_px is not None and np.abs(residual_px).max() < 0.3
 
 
@@ -32,7 +32,7 @@ def checked(world: World) -> dict[str, object]:
     cameras, resting = RigCameras(world, rig(), PointingSettings()), world.read()
     views = cameras.new(("navcam_left", "navcam_right"), world.clock.now_s(), resting)
     one, other = views["navcam_left"], views["navcam_right"]
-    return check_one_moment(cameras, one, np.array([150.0, 120.0]), [other], resting)
+    return cameras.check_one_moment(one, np.array([150.0, 120.0]), [other], resting)
 
 
 def test_what_moves_by_half_a_pixel_between_the_eyes_is_not_measured() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from calib.files.mast_file import load_rig
 from drivers.interfaces import AxisReport
-from mastctl.motion.results import counts_left
+from mastctl.motion.steps import counts_left
 
 COUNT_RAD = math.tau / 4096
 

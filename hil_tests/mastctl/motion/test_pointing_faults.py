@@ -21,12 +21,12 @@ from drivers.hardware import DeviceSettings, Hardware, HardwareSettings
 from drivers.open_hardware import open_hardware
 from drivers.simulation_clock import SimulationClock
 from hil_tests.mastctl.motion.pointing_world import SIZE_PX, World, click, rig, run
+from mastctl.answers import PointingResult, Step
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.limits import Limits
 from mastctl.motion.loop import PointingLoop
-from mastctl.motion.requests import PixelTarget, PointRequest
-from mastctl.motion.results import PointingError, PointingResult, Step
+from mastctl.motion.requests import PixelTarget, PointingError, PointRequest
 from mastctl.motion.settings import PointingSettings
 from mastctl.packaged import config_folder
 
@@ -54,11 +54,11 @@ def test_an_encoder_that_slips_within_play_shows_as_the_true_residual() -> None:
     point = world.true_point(frame, 90.0, 70.0)
     world.slip_rad = (0.006, -0.004)
     result, _ = run(world, click(frame, 90.0, 70.0))
-    (pointing,) = result.pointings
-    truth = world.true_pixel(pointing.frame_id, point) - np.array(MIDDLE_PX)
+    (pointing,) = result["pointings"]
+    truth = world.true_pixel(pointing["frame_id"], point) - np.array(MIDDLE_PX)
     assert np.abs(truth).max() > 3.0
-    assert pointing.residual_px is not None
-    assert np.abs(np.array(pointing.residual_px) - truth).max() < RIGHT_ANYWAY_PX
+    assert pointing["residual_px"] is not None
+    assert np.abs(np.array(pointing["residual_px"]) - truth).max() < RIGHT_ANYWAY_PX
 
 
 def shifted(image: np.ndarray, dx: int, dy: int) -> np.ndarray:
@@ -174,7 +174,7 @@ class Rover:
                 self.clock.sleep(0.01)
 
     def true_residual_px(self, result: PointingResult, point: np.ndarray) -> np.ndarray:
-        frame = self.devices.frame_by_id(result.pointings[-1].frame_id)
+        frame = self.devices.frame_by_id(result["pointings"][-1]["frame_id"])
         middle = self.rig.cameras["navcam_left"].model.image_center_px
         return self.truth.true_pixel("navcam_left", frame.sequence, point) - np.array(middle)
 
@@ -201,7 +201,7 @@ def rover(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Rover]:
 def test_the_healthy_rover_points_and_measures_what_is_true(rover: Rover) -> None:
     target, point = rover.begin()
     result = rover.point(PointRequest(pixel=target, pointings=2))
-    residual = result.pointings[-1].residual_px
+    residual = result["pointings"][-1]["residual_px"]
     assert residual is not None
     truth = rover.true_residual_px(result, point)
     assert np.abs(truth).max() < 1.0
@@ -241,7 +241,7 @@ def test_a_fault_ends_a_pointing_by_its_own_code_or_does_no_harm(
     target, point = rover.begin()
 
     def record(step: Step) -> None:
-        if step.name == after:
+        if step["name"] == after:
             rover.truth.faults.set(device, word)
 
     begun_s = rover.clock.now_s()
@@ -253,6 +253,6 @@ def test_a_fault_ends_a_pointing_by_its_own_code_or_does_no_harm(
         assert rover.clock.now_s() - begun_s < LONGEST_S + 30.0
         return
     result = rover.point(PointRequest(pixel=target), record)
-    residual = result.pointings[-1].residual_px
+    residual = result["pointings"][-1]["residual_px"]
     assert residual is not None
     assert np.abs(np.array(residual) - rover.true_residual_px(result, point)).max() < RIGHT_ANYWAY_PX

@@ -22,9 +22,9 @@ from hil_tests.mastctl.motion.pointing_world import (
     run,
     true_camera,
 )
+from mastctl.answers import Step
 from mastctl.as_json import as_json
-from mastctl.motion.requests import Aim, PixelTarget, PointRequest
-from mastctl.motion.results import PointingError, Step
+from mastctl.motion.requests import Aim, PixelTarget, PointingError, PointRequest
 from mastctl.motion.settings import PointingSettings
 
 MIDDLE_PX = ((SIZE_PX[0] - 1) / 2, (SIZE_PX[1] - 1) / 2)
@@ -45,16 +45,16 @@ def test_a_clicked_pixel_lands_on_the_aim_and_the_residual_is_the_true_one(
     frame = world.shoot()
     point = world.true_point(frame, *pixel)
     result, _ = run(world, click(frame, *pixel, pointings=2))
-    assert result.position_m is not None
-    assert np.linalg.norm(np.array(result.position_m) - point) < 0.03
-    assert len(result.pointings) == 2
-    for pointing in result.pointings:
-        assert pointing.residual_px is not None
-        assert pointing.residual_sigma_px is not None
-        truth = true_residual_px(world, pointing.frame_id, point, MIDDLE_PX)
+    assert result["position_m"] is not None
+    assert np.linalg.norm(np.array(result["position_m"]) - point) < 0.03
+    assert len(result["pointings"]) == 2
+    for pointing in result["pointings"]:
+        assert pointing["residual_px"] is not None
+        assert pointing["residual_sigma_px"] is not None
+        truth = true_residual_px(world, pointing["frame_id"], point, MIDDLE_PX)
         assert np.abs(truth).max() < 0.5
-        assert np.abs(np.array(pointing.residual_px) - truth).max() < MEASURED_PX
-        assert max(pointing.residual_sigma_px) < MEASURED_PX
+        assert np.abs(np.array(pointing["residual_px"]) - truth).max() < MEASURED_PX
+        assert max(pointing["residual_sigma_px"]) < MEASURED_PX
 
 
 def test_a_position_is_as_sure_as_the_pixels_and_the_match_behind_it() -> None:
@@ -66,7 +66,8 @@ def test_a_position_is_as_sure_as_the_pixels_and_the_match_behind_it() -> None:
         steps: list[Step] = []
         loop_of(world, steps, settings=settings).run(click(frame, 150.0, 120.0))
         frames, stereo, place = (
-            next(s.detail for s in steps if s.name == name) for name in ("frames", "stereo", "triangulate")
+            next(s["detail"] for s in steps if s["name"] == name)
+            for name in ("frames", "stereo", "triangulate")
         )
         match_px = max(stereo["sigma_px"])
         assert match_px > 0.04, "where the match adds nothing, nothing is shown"
@@ -85,10 +86,10 @@ def test_the_ground_behind_a_rocks_edge_does_not_pull_the_residual(from_edge_px:
     pixel = float(edge[0] + from_edge_px), 190.0
     point = world.true_point(frame, *pixel)
     result, _ = run(world, click(frame, *pixel))
-    (pointing,) = result.pointings
-    off = np.array(pointing.residual_px) - true_residual_px(world, pointing.frame_id, point, MIDDLE_PX)
+    (pointing,) = result["pointings"]
+    off = np.array(pointing["residual_px"]) - true_residual_px(world, pointing["frame_id"], point, MIDDLE_PX)
     assert np.abs(off).max() < 0.04
-    assert (np.abs(off) < 3.0 * np.array(pointing.residual_sigma_px)).all()
+    assert (np.abs(off) < 3.0 * np.array(pointing["residual_sigma_px"])).all()
 
 
 def test_a_wrong_mast_file_shows_as_a_residual_and_not_as_nothing() -> None:
@@ -96,11 +97,11 @@ def test_a_wrong_mast_file_shows_as_a_residual_and_not_as_nothing() -> None:
     frame = world.shoot()
     point = world.true_point(frame, *pixel)
     result, _ = run(world, click(frame, *pixel, pointings=2), rig(twist_error_rad=0.05))
-    for pointing in result.pointings:
-        assert pointing.residual_px is not None
-        truth = true_residual_px(world, pointing.frame_id, point, MIDDLE_PX)
-        assert np.abs(np.array(pointing.residual_px) - truth).max() < MEASURED_PX
-    first = true_residual_px(world, result.pointings[0].frame_id, point, MIDDLE_PX)
+    for pointing in result["pointings"]:
+        assert pointing["residual_px"] is not None
+        truth = true_residual_px(world, pointing["frame_id"], point, MIDDLE_PX)
+        assert np.abs(np.array(pointing["residual_px"]) - truth).max() < MEASURED_PX
+    first = true_residual_px(world, result["pointings"][0]["frame_id"], point, MIDDLE_PX)
     assert np.linalg.norm(first) > 1.0
 
 
@@ -110,14 +111,17 @@ def test_any_pixel_of_another_camera_can_be_the_aim() -> None:
     point = world.true_point(frame, *pixel)
     aim = Aim("pancam_right", 200.0, 130.0)
     result, steps = run(world, click(frame, *pixel, aim=aim, pointings=2))
-    eyes = next(step for step in steps if step.name == "eyes")
-    assert eyes.detail["confirmed_by"] == ["navcam_left", "navcam_right"]  # pancam_left cannot see it so near
-    last = result.pointings[-1]
-    assert last.camera == "pancam_right"
-    assert last.residual_px is not None
-    truth = true_residual_px(world, last.frame_id, point, (aim.x_px, aim.y_px))
+    eyes = next(step for step in steps if step["name"] == "eyes")
+    assert eyes["detail"]["confirmed_by"] == [
+        "navcam_left",
+        "navcam_right",
+    ]  # pancam_left cannot see it so near
+    last = result["pointings"][-1]
+    assert last["camera"] == "pancam_right"
+    assert last["residual_px"] is not None
+    truth = true_residual_px(world, last["frame_id"], point, (aim.x_px, aim.y_px))
     assert np.abs(truth).max() < 1.0
-    assert np.abs(np.array(last.residual_px) - truth).max() < MEASURED_PX
+    assert np.abs(np.array(last["residual_px"]) - truth).max() < MEASURED_PX
 
 
 def test_a_frame_from_another_pose_serves_while_the_target_is_in_view() -> None:
@@ -126,9 +130,9 @@ def test_a_frame_from_another_pose_serves_while_the_target_is_in_view() -> None:
     point = world.true_point(frame, *pixel)
     world.place(0.08, -0.5)
     result, _ = run(world, click(frame, *pixel))
-    residual = result.pointings[0].residual_px
+    residual = result["pointings"][0]["residual_px"]
     assert residual is not None
-    truth = true_residual_px(world, result.pointings[0].frame_id, point, MIDDLE_PX)
+    truth = true_residual_px(world, result["pointings"][0]["frame_id"], point, MIDDLE_PX)
     assert np.abs(np.array(residual) - truth).max() < MEASURED_PX
 
 
@@ -148,24 +152,26 @@ def test_a_position_is_pointed_at_and_its_missing_residual_is_explained(
 ) -> None:
     world = World()
     result, steps = run(world, PointRequest(position_m=[4.0, 0.7, 0.0], frame=frame))
-    (pointing,) = result.pointings
-    assert pointing.residual_px is None
-    assert pointing.residual_sigma_px is None
-    assert "no picture" in pointing.note
-    assert np.allclose(world.true_pixel(pointing.frame_id, np.array([4.0, 0.7, 0.0])), MIDDLE_PX, atol=1e-6)
-    assert np.allclose(pointing.predicted_px, MIDDLE_PX, atol=1e-6)
-    assert [step.name for step in steps] == ["rest", "solve", "before", "limits", "move", "settle", "look"]
+    (pointing,) = result["pointings"]
+    assert pointing["residual_px"] is None
+    assert pointing["residual_sigma_px"] is None
+    assert "no picture" in pointing["note"]
+    assert np.allclose(
+        world.true_pixel(pointing["frame_id"], np.array([4.0, 0.7, 0.0])), MIDDLE_PX, atol=1e-6
+    )
+    assert np.allclose(pointing["predicted_px"], MIDDLE_PX, atol=1e-6)
+    assert [step["name"] for step in steps] == ["rest", "solve", "before", "limits", "move", "settle", "look"]
 
 
 def test_the_record_names_every_step_in_order_with_plain_numbers() -> None:
     world = World()
     result, steps = run(world, click(world.shoot(), 120.0, 90.0, pointings=2))
     one = ["solve", "limits", "move", "settle", "look", "measure", "eyes", "repeat"]
-    assert [step.name for step in steps] == [
+    assert [step["name"] for step in steps] == [
         "rest", "frames", "target", "stereo", "triangulate", *one, "triangulate", "rest", *one
     ]  # fmt: skip
-    assert all(step.state == "done" for step in steps)
-    assert all(step.duration_s >= 0.0 for step in steps)
+    assert all(step["state"] == "done" for step in steps)
+    assert all(step["duration_s"] >= 0.0 for step in steps)
     json.dumps([as_json(step) for step in steps])
     json.dumps(as_json(result), allow_nan=False)
 
@@ -174,9 +180,9 @@ def test_the_new_picture_is_exposed_after_the_head_has_settled() -> None:
     world = World()
     frame = world.shoot()
     result, steps = run(world, click(frame, 100.0, 90.0))
-    settled = next(step for step in steps if step.name == "settle")
-    new = world.frame_by_id(result.pointings[0].frame_id)
-    assert new.exposure_began_s >= settled.started_s + settled.duration_s
+    settled = next(step for step in steps if step["name"] == "settle")
+    new = world.frame_by_id(result["pointings"][0]["frame_id"])
+    assert new.exposure_began_s >= settled["started_s"] + settled["duration_s"]
 
 
 def test_a_target_beyond_the_limits_is_refused_and_nothing_moves() -> None:
@@ -187,8 +193,8 @@ def test_a_target_beyond_the_limits_is_refused_and_nothing_moves() -> None:
         loop.run(PointRequest(position_m=[-4.0, 0.1, 0.0]))
     assert refusal.value.code == "outside_limits"
     assert refusal.value.step == "solve"
-    assert steps[-1].state == "failed"
-    assert steps[-1].detail["code"] == "outside_limits"
+    assert steps[-1]["state"] == "failed"
+    assert steps[-1]["detail"]["code"] == "outside_limits"
     assert not world.moves
     assert world.stops == 1
 
@@ -251,7 +257,7 @@ def test_cancelling_during_the_move_stops_the_head() -> None:
     with pytest.raises(PointingError) as refusal:
         loop.run(click(frame, 90.0, 60.0))
     assert refusal.value.code == "stopped"
-    assert steps[-1].name == "settle"
+    assert steps[-1]["name"] == "settle"
     assert world.stops == 1
 
 
@@ -267,8 +273,8 @@ def test_a_failure_after_the_first_pointing_keeps_its_result() -> None:
         run(world, click(frame, 120.0, 90.0, pointings=2))
     assert refusal.value.code == "target_not_found"
     assert refusal.value.result is not None
-    assert len(refusal.value.result.pointings) == 1
-    assert refusal.value.result.pointings[0].residual_px is not None
+    assert len(refusal.value.result["pointings"]) == 1
+    assert refusal.value.result["pointings"][0]["residual_px"] is not None
 
 
 def preview(world: World, request: PointRequest) -> Any:
@@ -288,7 +294,7 @@ def test_a_preview_tells_what_a_pointing_then_finds_and_nothing_moves() -> None:
     assert told["range_sigma_m"] <= np.linalg.norm(told["sigma_m"]) + 1e-12
     result, _ = run(world, click(frame, *pixel))
     assert told["goal_rad"] == pytest.approx(
-        (result.pointings[0].commanded_pan_rad, result.pointings[0].commanded_tilt_rad), abs=2e-3
+        (result["pointings"][0]["commanded_pan_rad"], result["pointings"][0]["commanded_tilt_rad"]), abs=2e-3
     )
 
 

@@ -14,11 +14,11 @@ from calib.errors import CalibError
 from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid, carried_covariance
-from mastctl.devices.limits import Limits
+from calib.geometry.pointing import choose
 from mastctl.errors import MastctlError
-from mastctl.motion.pairs import choose_pairs
-from mastctl.motion.poses import HELD_UP_S, RoverPose, check_follows, motion_between, stands
+from mastctl.motion.search import choose_pairs
 from mastctl.motion.settings import HandoffRules, PairBounds
+from mastctl.motion.track import HELD_UP_S, RoverPose, check_follows, motion_between, stands
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,9 @@ def test_nobody_who_sees_it_is_told_camera_by_camera(rig: Rig) -> None:
     with pytest.raises(CalibError, match=r"no stereo pair sees the target.*hazcam_left has it at pixel"):
         choose_pairs(blind, np.array([-1.5, 0.2, 0.0]))
     with pytest.raises(CalibError, match="beyond the limit"):
-        choose_pairs(rig, np.array([-5.0, 0.2, 0.0]), limits=Limits((-1.0, 1.0), (-1.2, 0.5), 1.0))
+        choose_pairs(
+            rig, np.array([-5.0, 0.2, 0.0]), chosen=lambda some: choose(some, (-1.0, 1.0), (-1.2, 0.5))
+        )
 
 
 def pose(

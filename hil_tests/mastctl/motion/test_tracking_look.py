@@ -17,9 +17,9 @@ from calib.geometry.rigid import Rigid
 from calib.matching.track import Track, moved_track
 from drivers.errors import NoReply
 from hil_tests.mastctl.motion.pointing_world import LIMITS, SIZE_PX, World, rig
+from mastctl.answers import Step
 from mastctl.devices.frames import StampedFrame
-from mastctl.motion.requests import PixelTarget
-from mastctl.motion.results import PointingError, Step
+from mastctl.motion.requests import PixelTarget, PointingError
 from mastctl.motion.search import NotTrackable, TargetSearch
 from mastctl.motion.settings import TrackingSettings
 
@@ -78,7 +78,15 @@ def test_a_start_and_a_look_put_the_target_where_it_is() -> None:
     after, seen = search(world, steps).find(track)
     assert (seen.state, seen.pair, seen.reason) == ("tracked", "navcam", "")
     assert np.linalg.norm(after.position_m - point) < 0.03
-    assert [step.name for step in steps] == ["choose", "before", "limits", "move", "settle", "look", "find"]
+    assert [step["name"] for step in steps] == [
+        "choose",
+        "before",
+        "limits",
+        "move",
+        "settle",
+        "look",
+        "find",
+    ]
     pixels = [np.array([seen.pixels[eye].x_px, seen.pixels[eye].y_px]) for eye in rig().stereo["navcam"]]
     middle = (np.array(SIZE_PX) - 1) / 2
     assert np.mean(pixels, axis=0) == pytest.approx(middle, abs=2.0), "pointed before the picture was taken"
@@ -192,12 +200,12 @@ def test_a_change_of_the_pair_looks_with_both_and_keeps_what_they_saw() -> None:
     assert (seen.state, seen.pair, seen.reason) == ("tracked", "navcam", "")
     assert np.linalg.norm(after.position_m - point) < 0.03
     one = ["limits", "move", "settle", "look", "find"]
-    names = [step.name for step in steps if step.name != "before"]
+    names = [step["name"] for step in steps if step["name"] != "before"]
     assert names == ["choose", *one, *one, "hand_over"]
     record = seen.matched
     assert record is not None
     assert (record.pair, list(record.found)) == (rig().stereo["pancam"], list(rig().stereo["navcam"]))
-    frames = {name[:-7]: name for step in steps for name in step.detail.get("frame_ids", ())}
+    frames = {name[:-7]: name for step in steps for name in step["detail"].get("frame_ids", ())}
     for eye, pixel in zip(record.pair, record.clicks_px, strict=True):
         assert pixel == pytest.approx(world.true_pixel(frames[eye], point), abs=0.6)
     for eye, landed in record.found.items():
@@ -241,7 +249,7 @@ def test_a_pose_that_the_pictures_contradict_is_told_by_the_look(found_by: str) 
     _, seen = search(world, steps).find(said, found_by)
     off = re.search(r"([\d.]+) cm \(([\d.]+) sigma\) from where the pose", seen.pose_doubt)
     assert off is not None and float(off[1]) == pytest.approx(12.0, abs=1.5) and float(off[2]) > 4.0
-    assert any(step.detail.get("pose_doubt") == seen.pose_doubt for step in steps)
+    assert any(step["detail"].get("pose_doubt") == seen.pose_doubt for step in steps)
     honest = moved_track(track, Rigid(np.eye(3), np.zeros(3)), told)
     assert search(world).find(honest, found_by)[1].pose_doubt == ""
 

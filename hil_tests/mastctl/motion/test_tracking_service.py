@@ -29,7 +29,7 @@ from hil_tests.waiting import NET_S, until
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
-from mastctl.motion import tracker as tracker_module
+from mastctl.motion import track as track_module
 from mastctl.motion.search import CameraPixel, TrackSighting
 from mastctl.motion.settings import PointingSettings
 from mastctl.motion.steps import Steps
@@ -90,7 +90,7 @@ def lost(track: Track) -> tuple[Track, TrackSighting]:
 
 @pytest.fixture
 def pair(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[tuple[RunningDaemon, FakeHardware]]:
-    monkeypatch.setattr(tracker_module, "TargetSearch", ScriptedSearch)
+    monkeypatch.setattr(track_module, "TargetSearch", ScriptedSearch)
     monkeypatch.setattr(ScriptedSearch, "script", staticmethod(found), raising=False)
     monkeypatch.setattr(ScriptedSearch, "begin", staticmethod(lambda: None))
     monkeypatch.setattr(ScriptedSearch, "looks", [], raising=False)

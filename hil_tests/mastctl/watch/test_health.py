@@ -12,10 +12,10 @@ import pytest
 
 from drivers.clock import SystemClock
 from drivers.interfaces import COARSE_COUNT_RAD
+from hil_tests.mastctl.service_fakes import fake_step
 from hil_tests.mastctl.watch.histories import NOON_S, bumped, pointing, stored_rig
 from hil_tests.waiting import until
 from mastctl.control.records import Operation
-from mastctl.motion.results import Step
 from mastctl.watch import evidence
 from mastctl.watch.evidence import FILE, Measured, measured_by, measured_of, pointing_journal
 from mastctl.watch.journal import JournalThread
@@ -44,7 +44,7 @@ def ended_pointing() -> Operation:
             "residual_px": [0.5, 1.5],
         },
     }
-    steps = tuple(Step(name, "done", 0.0, 0.1, detail) for name, detail in details.items())
+    steps = tuple(fake_step(name, **detail) for name, detail in details.items())
     request = {"pixel": {"camera": "navcam_right", "frame_id": "f", "x_px": 1.0, "y_px": 2.0}}
     return Operation("000001-ab", "done", request, 0.0, 0.0, 1.0, steps)
 

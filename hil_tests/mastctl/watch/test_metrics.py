@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from hil_tests.mastctl.service_fakes import FakePointing, FakeResult
+from hil_tests.mastctl.service_fakes import fake_result
 from hil_tests.waiting import until
 from mastctl.control.publisher import Publisher
 from mastctl.control.records import Operation
@@ -31,7 +31,7 @@ STATUS: Any = {
     "sentinel": None,
 }
 
-DONE = FakeResult((6.0, 1.0, 0.0), 6.2, (FakePointing((0.3, -0.1), (0.1, 0.1), "navcam_left-1"),))
+DONE = fake_result((6.0, 1.0, 0.0), 6.2, (0.3, -0.1))
 
 Found = dict[tuple[str, tuple[tuple[str, str], ...]], float]
 

@@ -1,12 +1,16 @@
-"""New images and what they show: frames of a resting head, the clicked thing found again in them."""
+"""New images and what they show: the clicked thing found again, the motion of the head, one moment.
+
+All geometry is by the mast file and the true joint angles measured.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -16,18 +20,45 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.matching.partner import StereoMatch, find_partner
 from calib.matching.patch import match_patch
+from calib.matching.shown_view import Posed, ShownView, overlap, shown_view
 from calib.matching.sweep import UP
 from calib.matching.verdict import MatchSettings, PatchMatch
 from calib.matching.warp import Plane, PosedImage, Relief, carry, facing_plane, grey
-from drivers.errors import DriverError
+from drivers.errors import BadFrame, DriverError
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
-from mastctl.motion.head import DevicesLike
-from mastctl.motion.results import PointingError, rounded
+from mastctl.devices.keep_out import Pair
+from mastctl.motion.requests import PointingError
 from mastctl.motion.settings import PointingSettings
 
 BESIDE = "; try a pixel beside it"
 """To a person who clicked: at a rim or on bare ground a neighbour may match."""
+LEAST_OVERLAP = 0.15
+"""Less of an image in common is not worth an image before the move."""
+
+
+class DevicesLike(Protocol):
+    """What of `mastctl.devices.devices.Devices` a pointing needs."""
+
+    def read(self) -> HeadReading: ...
+    @property
+    def reading_sigma_rad(self) -> Pair: ...
+    @property
+    def counts_rad(self) -> Mapping[str, float]: ...
+    def goal(self, true_rad: Pair, start: HeadReading, /) -> Pair: ...
+    def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None: ...
+    def stop(self) -> None: ...
+    def check_from(self, start: Pair, goal: Pair) -> None: ...
+    def frames(
+        self,
+        cameras: Sequence[str],
+        exposed_after_s: float,
+        timeout_s: float,
+        check: Callable[[], None] = ...,
+    ) -> dict[str, StampedFrame]: ...
+    def newest_frames(self) -> Mapping[str, StampedFrame | None]: ...
+    def frame_by_id(self, frame_id: str) -> StampedFrame: ...
+    def exposure_held(self) -> AbstractContextManager[None]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,9 +84,10 @@ class Clicked:
 
 
 class RigCameras:
-    """The cameras during one request; all geometry by the mast file and the true joint angles measured.
+    """The cameras during one request, with the last image of each head camera.
 
-    ``check`` is called while images are waited for, and ends the wait by raising.
+    ``check`` is called while images are waited for, and ends the wait by raising. Images of two requests are
+    not compared: in between the rover may have been driven.
     """
 
     def __init__(
@@ -65,10 +97,11 @@ class RigCameras:
         settings: PointingSettings,
         check: Callable[[], None] = lambda: None,
     ) -> None:
-        self.settings = settings
+        self._settings = settings
         self._devices = devices
         self._rig = rig
         self._check = check
+        self._before: dict[str, tuple[Posed, tuple[str, Posed] | None]] = {}
 
     def partner(self, camera: str) -> str | None:
         """Return the other camera of a camera's stereo pair, None if it has none."""
@@ -105,7 +138,7 @@ class RigCameras:
         DriverError if a frame does not come, or cannot be used.
         """
         views = {}
-        timeout_s = self.settings.frame_timeout_s if timeout_s is None else timeout_s
+        timeout_s = self._settings.frame_timeout_s if timeout_s is None else timeout_s
         for name, frame in self._devices.frames(names, after_s, timeout_s, self._check).items():
             if frame.exposure_began_s < after_s:
                 early_s = after_s - frame.exposure_began_s
@@ -113,33 +146,112 @@ class RigCameras:
                     "no_fresh_frame", f"an image of {name} was exposed {early_s:.3f} s too early"
                 )
             apart = max(abs(frame.pan_rad - resting.pan_rad), abs(frame.tilt_rad - resting.tilt_rad))
-            if frame.moving or not apart <= self.settings.rest_tolerance_rad:
+            if frame.moving or not apart <= self._settings.rest_tolerance_rad:
                 where = f"an image of {name} was exposed ({apart:.4f} rad off its rest)"
                 raise PointingError("head_moving", f"the head moved while {where}")
             views[name] = self.view(frame)
         return views
 
-    def some(
-        self,
-        names: Sequence[str],
-        after_s: float,
-        resting: HeadReading,
-        needed: Sequence[str] = (),
-        timeout_s: float | None = None,
-    ) -> tuple[dict[str, CameraView], dict[str, str]]:
-        """Return frames as `new` of those cameras that give one, and why another gives none.
+    def view(self, frame: StampedFrame) -> CameraView:
+        """Return a frame with its camera. Raises PointingError ``bad_reading``."""
+        if not all(map(math.isfinite, (frame.pan_rad, frame.tilt_rad, *frame.true_rad))):
+            raise PointingError("bad_reading", f"frame {frame.frame_id} has no finite joint angles")
+        camera = self._rig.camera_in_rover(frame.camera, *frame.true_rad)
+        return CameraView(grey(frame.image), camera, frame)
 
-        Raises what `new` does of a camera that is ``needed``, and of the head.
+    # Did the images move as the joints did?
+
+    def remember(self, views: Mapping[str, CameraView]) -> None:
+        """Keep images of one moment for the next comparison."""
+        posed = {name: _posed(view) for name, view in views.items() if self._on_head(name)}
+        for name, image in posed.items():
+            other = self.partner(name)
+            self._before[name] = image, None if other not in posed else (other, posed[other])
+
+    def lacking(self, cameras: Sequence[str], start_rad: Pair, goal_rad: Pair) -> list[str]:
+        """Return the head cameras without an image, of which one before a move will show something.
+
+        None of a move that is smaller than what need not show, or that leaves too little in common.
         """
-        missing: dict[str, str] = {}
-        while left := [name for name in names if name not in missing]:
-            try:
-                return self.new(left, after_s, resting, timeout_s), missing
-            except DriverError as error:
-                if error.device not in left or error.device in needed:
-                    raise
-                missing[error.device] = " ".join(str(error).split())
-        return {}, missing
+        way_rad = max(abs(goal - start) for goal, start in zip(goal_rad, start_rad, strict=True))
+        if way_rad <= self._settings.view.floor_rad:
+            return []
+        wanted = [
+            name
+            for name in cameras
+            if name in self._devices.newest_frames() and self._on_head(name) and name not in self._before
+        ]
+        return [name for name in wanted if overlap(self._rig, name, start_rad, goal_rad) >= LEAST_OVERLAP]
+
+    def check_motion(self, views: Mapping[str, CameraView], detail: dict[str, Any]) -> None:
+        """Compare new images of one moment with the last ones of the same cameras, and keep them instead.
+
+        ``detail`` gets ``motion_evidence``, what was seen by camera. The first image of a camera has nothing
+        before it, and is accepted. Raises BadFrame if an image shows another view than the joints say.
+        """
+        evidence = detail["motion_evidence"] = dict[str, dict[str, Any]]()
+        refused: BadFrame | None = None
+        for name, view in views.items():
+            if not self._on_head(name):
+                evidence[name] = {"verdict": "on_body"}
+                continue
+            if name not in self._before:
+                evidence[name] = {"verdict": "no_picture_before"}
+                continue
+            before, beside = self._before[name]
+            after = _posed(view)
+            shown = shown_view(self._rig, name, before, after, beside, self._settings.view)
+            evidence[name] = _facts(shown)
+            if shown.verdict in ("contradicted", "unlike"):
+                refused = refused or BadFrame(
+                    _contradiction(shown, before, after), device=name, detail=evidence[name]
+                )
+        if refused is not None:
+            raise refused
+        self.remember(views)
+
+    def check_one_moment(
+        self, view: CameraView, pixel_px: FloatArray, others: Sequence[CameraView], resting: HeadReading
+    ) -> dict[str, Any]:
+        """Check that what a pixel shows moves by less than half a pixel between exposures of several cameras.
+
+        Where these were not at one moment, its speed is measured in a further image of the first camera, in
+        the image itself: the mast and the target count alike. That the head reports no motion is checked
+        before (`new`). Returns for the record ``dt_s`` by other camera, and ``image_speed_px_per_s``,
+        ``moved_px`` where measured.
+
+        Raises PointingError ``target_moving`` if it moves too far, or is not found where it was; DriverError
+        if the further image does not come.
+        """
+        detail = apart(view, others)
+        moments_s = (0.0, *detail["dt_s"].values())
+        spread_s = max(moments_s) - min(moments_s)
+        if spread_s <= self._settings.same_moment_s:
+            return detail
+        camera = view.frame.camera
+        later = self.new((camera,), view.frame.exposure_began_s, resting)[camera]
+        between_s = later.frame.exposure_began_s - view.frame.exposure_began_s
+        try:
+            seen = self.again(view, pixel_px, later)
+        except PointingError as error:
+            raise PointingError(
+                "target_moving",
+                f"the cameras were exposed {1e3 * spread_s:.1f} ms apart, and {1e3 * between_s:.1f} ms later "
+                f"{camera} does not see the target where it was: {error}",
+            ) from None
+        speed = float(np.linalg.norm(seen.pixel_px - pixel_px)) / between_s
+        moved_px = speed * spread_s
+        detail.update(image_speed_px_per_s=round(speed, 3), moved_px=round(moved_px, 4))
+        if moved_px >= self._settings.between_cameras_px:
+            raise PointingError(
+                "target_moving",
+                f"the target moves at {speed:.1f} px/s in {camera}, {moved_px:.2f} px between exposures "
+                f"{1e3 * spread_s:.1f} ms apart; less than {self._settings.between_cameras_px:g} px serves a "
+                "measurement",
+            )
+        return detail
+
+    # Where is the clicked thing?
 
     def again(self, view: CameraView, pixel_px: FloatArray, now: CameraView) -> PatchMatch:
         """Find a clicked pixel in a new frame of the same camera, before its range is known.
@@ -147,7 +259,7 @@ class RigCameras:
         Raises PointingError ``not_in_view`` if the head has turned away since, ``target_...`` if the match is
         not good.
         """
-        settings = self.settings
+        settings = self._settings
         turned = max(
             abs(view.frame.pan_rad - now.frame.pan_rad), abs(view.frame.tilt_rad - now.frame.tilt_rad)
         )
@@ -176,7 +288,7 @@ class RigCameras:
         Raises PointingError ``target_...`` if the match is not good, ``eyes_disagree`` if it lies off the
         line.
         """
-        settings = self.settings
+        settings = self._settings
         found = find_partner(view, pixel_px, other, settings.nearest_m, settings.match)
         if found.match.verdict in ("weak", "ambiguous", "flat"):
             raise _refusal(found.match, other, BESIDE)
@@ -189,21 +301,23 @@ class RigCameras:
             )
         return found
 
-    def look_for(self, clicked: Clicked, now: CameraView) -> PatchMatch:
+    def find(self, clicked: Clicked, now: CameraView) -> PatchMatch:
         """Find the clicked thing in a new view: near where it should be, then further around.
 
         Raises PointingError ``target_...`` if no match is good.
         """
-        settings = self.settings
+        settings = self._settings
         planes = [clicked.plane, *clicked.others]
         ray = clicked.view.camera.ray(clicked.pixel_px)
         if abs(float(ray.directions @ clicked.plane.normal)) < 0.97:
             planes.append(Plane(clicked.plane.point_m, -ray.directions))  # if the slope was misjudged
+        usual = settings.match
+        sizes: tuple[MatchSettings, ...] = usual, replace(usual, half_px=settings.small_half_px)
         found: list[PatchMatch] = []
         for search in (settings.search_px, settings.wide_search_px):
-            for plane, sizes in product(planes, self._sizes()):
+            for plane, size in product(planes, sizes):
                 relief = clicked.relief if plane is clicked.plane else None
-                found.append(match_patch(clicked.view, clicked.pixel_px, plane, now, search, sizes, relief))
+                found.append(match_patch(clicked.view, clicked.pixel_px, plane, now, search, size, relief))
                 if found[-1].verdict == "good":
                     return found[-1]
             if found[0].verdict in ("flat", "ambiguous"):
@@ -225,9 +339,9 @@ class RigCameras:
 
         Raises PointingError ``eyes_disagree`` if the other camera does not confirm the place.
         """
-        settings = self.settings
+        settings = self._settings
         try:
-            confirmed = self.look_for(clicked, other)
+            confirmed = self.find(clicked, other)
         except PointingError as error:
             raise PointingError(
                 "eyes_disagree",
@@ -257,25 +371,22 @@ class RigCameras:
             )
         return confirmed, detail
 
+    def _on_head(self, name: str) -> bool:
+        return self._rig.cameras[name].on == "head"
+
     def _sees(self, name: str, position_m: FloatArray, resting: HeadReading) -> bool:
-        """Tell whether a configured camera has a position well inside its image."""
+        """Whether a configured camera has a position well inside its image."""
         if name not in self._devices.newest_frames():
             return False
         camera = self._rig.camera_in_rover(name, *resting.true_rad)
         place, valid = camera.project(position_m)
-        return bool(valid) and camera.holds(place, 2.0 * self.settings.match.half_px)
+        return bool(valid) and camera.holds(place, 2.0 * self._settings.match.half_px)
 
-    def _sizes(self) -> tuple[MatchSettings, MatchSettings]:
-        """Return the matching with the usual patch, and with one that may fit beside an edge."""
-        usual = self.settings.match
-        return usual, replace(usual, half_px=self.settings.small_half_px)
 
-    def view(self, frame: StampedFrame) -> CameraView:
-        """Return a frame with its camera. Raises PointingError ``bad_reading``."""
-        if not all(map(math.isfinite, (frame.pan_rad, frame.tilt_rad, *frame.true_rad))):
-            raise PointingError("bad_reading", f"frame {frame.frame_id} has no finite joint angles")
-        camera = self._rig.camera_in_rover(frame.camera, *frame.true_rad)
-        return CameraView(grey(frame.image), camera, frame)
+def apart(view: CameraView, others: Sequence[CameraView]) -> dict[str, Any]:
+    """Return ``dt_s`` for the record: how much later than the first camera each other began to expose."""
+    begun_s = view.frame.exposure_began_s
+    return {"dt_s": {o.frame.camera: round(o.frame.exposure_began_s - begun_s, 6) for o in others}}
 
 
 def match_facts(found: PatchMatch) -> Mapping[str, Any]:
@@ -288,8 +399,76 @@ def match_facts(found: PatchMatch) -> Mapping[str, Any]:
     }
 
 
+def rounded(values: FloatArray | Sequence[float], digits: int = 4) -> list[float]:
+    """Return numbers for a step's detail."""
+    return [round(float(value), digits) for value in np.asarray(values).ravel()]
+
+
+def available(
+    names: Sequence[str],
+    take: Callable[[list[str]], dict[str, CameraView]],
+    needed: Sequence[str] = (),
+) -> tuple[dict[str, CameraView], dict[str, str]]:
+    """Take images of those cameras that give one; return them, and why another gives none.
+
+    Raises what ``take`` does of a camera that is ``needed``, and of the head.
+    """
+    missing: dict[str, str] = {}
+    while left := [name for name in names if name not in missing]:
+        try:
+            return take(left), missing
+        except DriverError as error:
+            if error.device not in left or error.device in needed:
+                raise
+            missing[error.device] = " ".join(str(error).split())
+    return {}, missing
+
+
+def _posed(view: CameraView) -> Posed:
+    return Posed(view.image, *view.frame.true_rad)
+
+
+def _facts(shown: ShownView) -> dict[str, Any]:
+    """What was seen of a motion, for the record; numbers only where a view was found."""
+    facts: dict[str, Any] = {"verdict": shown.verdict}
+    if np.isfinite(shown.pan_rad):
+        facts.update(
+            pan_rad=round(shown.pan_rad, 6),
+            tilt_rad=round(shown.tilt_rad, 6),
+            off_rad=rounded(shown.off_rad, 6),
+            sigma_rad=rounded(shown.sigma_rad, 6),
+            allowed_rad=rounded(shown.allowed_rad, 6),
+            off_px=round(shown.off_px, 2),
+        )
+    return facts | {"patches": [shown.agreeing, shown.expected]}
+
+
+def _contradiction(shown: ShownView, before: Posed, after: Posed) -> str:
+    """Say what an image shows instead of what it should."""
+    expected = f"pan {after.pan_rad:.3f}, tilt {after.tilt_rad:.3f} rad"
+    if shown.verdict == "unlike":
+        return (
+            f"the picture shows nothing of what {shown.expected} places of the picture before should show at "
+            f"{expected}: joints and pictures contradict each other"
+        )
+    start, goal = np.array(before.angles_rad), np.array(after.angles_rad)
+    seen, way = np.array([shown.pan_rad, shown.tilt_rad]), goal - start
+    allowed = np.array(shown.allowed_rad)
+    why = ""
+    if (np.abs(seen - start) <= allowed).all():
+        why = ", that of before the move"
+    elif way.any():
+        share = float(np.clip((seen - start) @ way / (way @ way), 0.0, 1.0))
+        if (np.abs(start + share * way - seen) <= allowed).all():
+            why = f", one on the way there ({100 * share:.0f} %)"
+    return (
+        f"the picture shows the view of pan {shown.pan_rad:.3f}, tilt {shown.tilt_rad:.3f} rad{why}, not of "
+        f"{expected} ({shown.off_px:.0f} px off): joints and pictures contradict each other"
+    )
+
+
 def _best(found: Sequence[PatchMatch]) -> PatchMatch:
-    """Return the good match of several, else the one that came nearest to one."""
+    """The good match of several, else the one that came nearest to one."""
     ranks = {"good": 0, "ambiguous": 1, "flat": 2, "weak": 3, "border": 4}
     return min(found, key=lambda one: (ranks[one.verdict], -one.correlation))
 
@@ -308,7 +487,7 @@ def _refusal(found: PatchMatch, view: CameraView, advice: str = "") -> PointingE
 
 
 def _plane_at(camera: CameraModel, pixel_px: FloatArray, range_m: float) -> Plane:
-    """Return the facing plane at a range. Raises PointingError for a pixel without a ray."""
+    """The facing plane at a range. Raises PointingError for a pixel without a ray."""
     try:
         return facing_plane(camera, pixel_px, range_m)
     except CalibError as error:
