@@ -84,7 +84,7 @@ def test_a_pointing_is_accepted_and_records_steps_and_residual(
     assert [step["name"] for step in record["steps"]] == ["look", "measure"]
     assert record["steps"][1]["detail"] == {"not_a_number": None}
     assert record["residual_px"] == [0.25, -0.5]
-    assert record["residual_sigma_px"] == [0.05, 0.06]
+    assert record["residual_sigma_px"] == [0.1, 0.2]
     assert record["position_m"] == [6.0, 0.0, 0.1]
     assert record["error"] is None
     status = web.get("/status").json()
