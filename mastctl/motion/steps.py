@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from calib.geometry.cahvor import CameraModel
+from calib.geometry.pointing import Solution, ordered
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
-from calib.geometry.pointing import Solution, ordered
 from calib.matching.verdict import PatchMatch
 from drivers.clock import Clock
 from drivers.errors import DriverError

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import CalibError
 from calib.files.mast_file import load_rig
+from calib.geometry.pointing import choose
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid, carried_covariance
-from calib.geometry.pointing import choose
 from mastctl.errors import MastctlError
 from mastctl.motion.search import choose_pairs
 from mastctl.motion.settings import HandoffRules, PairBounds
