@@ -1,12 +1,14 @@
-"""Gross measurements: which are too far off beside the others, and which goes first where one hides another.
+"""Gross measurements: which are too far off beside the others.
 
 Sizes are compared with the typical one, since stated sigmas may be too small: the median of many is not moved
-by a few blunders. Where a fit is moved by them, the worst is left out alone and the fit is done again.
+by a few blunders.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +21,39 @@ GROSS = 6.0
 
 MANY = 0.25
 """With more than this part of an image's dots beyond their limit, it is not the dots that are wrong."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outlier:
+    """A measurement that was not used, and the test it failed.
+
+    ``statistic`` is the sum of squares of its standardised residuals, ``limit`` the most that it may be: at
+    the stated rate of false alarms, wider where the typical measurement is farther off than its sigma says;
+    not-a-number for an image that was left out with its board's tapes. ``size`` is how far off it is: pixels
+    (rms over an image, in the worst camera of a hand-off, across the epipolar line of its clicks) or metres;
+    not-a-number for an image whose board, as it is named, the camera cannot see.
+    """
+
+    kind: Literal["dot", "image", "tape", "prism", "hand-off", "clicks"]
+    name: str
+    statistic: float
+    limit: float
+    size: float
+
+    @property
+    def sentence(self) -> str:
+        """The outlier for a person."""
+        if not np.isfinite(self.size):
+            return f"{self.name} cannot show the board that it names and was not used"
+        if self.kind == "clicks":
+            return (
+                f"{self.name} was not used: its two clicks do not mean one point, they are {self.size:.1f} "
+                f"px apart across the epipolar line, {math.sqrt(self.statistic):.1f} sigma"
+            )
+        if self.kind == "hand-off":
+            return f"{self.name} is off by {self.size:.1f} px after the correction and was not used"
+        off = f"{self.size:.2f} px" if self.kind in ("dot", "image") else f"{1000 * self.size:.1f} mm"
+        return f"{self.name} is off by {off} and was not used"
 
 
 def gross_limit(sizes: ArrayLike, expected: float = 0.0) -> float:
@@ -41,30 +76,3 @@ def at_least_stated(squares: FloatArray, freedom: int = 2) -> float:
 def bounded(lengths: FloatArray, limit: ArrayLike) -> FloatArray:
     """Return the weights (n,) of squares whose pull no longer grows from a length of ``limit`` on (Huber)."""
     return np.asarray(np.minimum(1.0, limit / np.maximum(lengths, 1e-300)))
-
-
-def worst_first(keep: np.ndarray, ratios: Callable[[np.ndarray], FloatArray], most_out: float) -> np.ndarray:
-    """Return which measurements (n,) agree.
-
-    Parameters
-    ----------
-    keep
-        (n,) those to begin with.
-    ratios
-        Of statistics to their limits (n,) when some are kept, by a fit to these. The worst beyond 1 goes
-        alone, and what passes comes back.
-    most_out
-        Part of them that may be left out; with more, it ends.
-    """
-    for _ in range(len(keep)):
-        if np.mean(~keep) > most_out:
-            break
-        found = ratios(keep)
-        failing = keep & (found > 1.0)
-        new = keep | (found <= 1.0)
-        if failing.any():
-            new[np.argmax(np.where(failing, found, 0.0))] = False
-        if (new == keep).all():
-            break
-        keep = new
-    return keep

@@ -20,7 +20,7 @@ from calib.adjust.adjustment import HUBER, Adjustment
 from calib.adjust.goodness import Component, found_sigmas, goodness, variance_components
 from calib.adjust.hypotheses import ScoredFit, find_contradictions
 from calib.adjust.outliers import judge, name_outliers
-from calib.adjust.scatter import own_scales, with_scales
+from calib.adjust.scatter import own_scales, scattering, with_scales
 from calib.adjust.solver import Minimum, minimise
 from calib.adjust.terms import ImageTerm, StationTerm, scattered_images, widened_images
 from calib.adjust.uncertainty import fitted_fields, image_residuals, open_directions
@@ -39,6 +39,9 @@ ROUNDS = 40
 
 WEIGHINGS = 6
 """Times that sigmas are changed and the fit done again, at most; three mostly do."""
+
+FAR_SCATTER = 1.5
+"""Dots that scatter in their images by so many times what is noise are what a far fit is far by."""
 
 WEIGHED = 0.02
 """Sigmas are good enough when the next ones differ by less than this part."""
@@ -218,13 +221,49 @@ def _refuse_lost(fit: Minimum[Estimate]) -> None:
         )
 
 
-def typical_length(
-    problem: Adjustment, state: Estimate, images: Sequence[ImageTerm], least_px: float
-) -> tuple[float, float]:
-    """Return how far the typical dot of some images is off, in sigmas, and the median of these, pixels; no
-    sigma counts as less than ``least_px``."""
-    own_px = np.concatenate([t.sigma_px[t.keep] for t in images])
-    own_sigma_px = np.maximum(own_px, least_px)
-    residuals = np.concatenate([r.reshape(-1, 2) for r in problem.residuals(state, images)])
-    lengths = np.linalg.norm(residuals, axis=1) * own_px / own_sigma_px
-    return float(np.sqrt(typical_scale(lengths**2))), float(np.median(own_sigma_px))
+def refuse_far(
+    problem: Adjustment,
+    state: Estimate,
+    stated_px: float,
+    *,
+    most: float,
+    dot: str,
+    disagree: str,
+    scatter: str,
+    coherent: str,
+) -> None:
+    """Raise SurveyNotFitted if a camera's typical dot is far above its noise, or too many of its images were
+    left out.
+
+    No dot's own sigma counts as less than ``stated_px``: what neighbours share, as a print's errors, is not
+    in it. The typical dot may be off ``most`` times the noise: stated sigmas are wrong by two or three, wrong
+    minima by a hundred. ``disagree``, ``scatter`` and ``coherent`` say what to check where images disagree,
+    where dots are off one by one, and where they are off together.
+    """
+    for name in state.cameras:
+        mine = [t for t in problem.images if t.camera == name]
+        kept = [t for t in mine if t.keep.any()]
+        if len(kept) < max(2, len(mine) // 2):
+            raise SurveyNotFitted(
+                f"camera {name}: {len(mine) - len(kept)} of its {len(mine)} images do not agree with the rest"
+                f"{disagree}"
+            )
+        own_px = np.concatenate([t.sigma_px[t.keep] for t in kept])
+        counted_px = np.maximum(own_px, stated_px)
+        off = np.concatenate([r.reshape(-1, 2) for r in problem.residuals(state, kept)])
+        lengths = np.linalg.norm(off, axis=1) * own_px / counted_px
+        typical, noise_px = float(np.sqrt(typical_scale(lengths**2))), float(np.median(counted_px))
+        squares = [one.square for _, one in scattering(problem, state, kept).values()]
+        excess = float(np.sqrt(np.median(squares))) if squares else 1.0
+        if excess > FAR_SCATTER:
+            raise SurveyNotFitted(
+                f"camera {name}: its {dot}s are off one by one, by {excess * noise_px:.2g} px beside a "
+                f"smooth map of each image, where {noise_px:.2g} px at most may count for noise "
+                f"({stated_px:g} px are stated): {scatter}"
+            )
+        if typical > most:
+            raise SurveyNotFitted(
+                f"camera {name}: the fit leaves {typical:.1f} times the noise of a {dot} ({noise_px:.2g} "
+                f"px), and {dot}s of an image are off together, not one by one: it ended in a wrong minimum, "
+                f"the lens is not of this model, or {coherent}"
+            )

@@ -9,6 +9,10 @@ that sigma is tested for coherent shifts alone.
 Images of a camera that agree with each other have one scale, their camera's; luck changes none. Nothing is
 taken for more exact than stated here. Scales end at `GROSS`, or `ORDER` times what the survey states of all
 dots: gross blunders are no noise.
+
+Pixels themselves are a smooth function of the place as well, whatever the lens and the board's pose: so wrong
+dots are found without a camera, for fits that take boards as exact. There the station's error moves all dots
+of an image, and would hide a wrong one.
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ import numpy as np
 from scipy.special import chdtrc, fdtrc
 
 from calib.adjust.adjustment import Adjustment
-from calib.adjust.gross import GROSS, bounded
+from calib.adjust.gross import GROSS, MANY, Outlier, at_least_stated, bounded
 from calib.adjust.terms import ImageTerm, scattered_images, widened_images
 from calib.adjust.unknowns import Estimate
 from calib.geometry.rigid import FloatArray
@@ -37,6 +41,13 @@ DEGREES = ((60, 3), (24, 2), (10, 1))
 
 BEYOND = 4.0
 """A dot so many times farther off than the typical one is no noise."""
+
+BLUNDER_DEGREES = ((60, 4, 6.0), (30, 3, 6.0), (16, 2, 10.0))
+"""Fewest dots for a polynomial of that degree, and how many times farther off than the typical one a dot is
+gross then; of fewer nothing is tested."""
+
+POLYNOMIAL_PX = 0.08
+"""What a polynomial of the fourth degree may miss, at the corners of a near board in a wide lens."""
 
 STEPS = 10
 PULL = 2.5
@@ -125,12 +136,6 @@ def scattering(
     return {term.name: (term, one) for term, one in measured if one is not None}
 
 
-def typical_excess(problem: Adjustment, state: Estimate, images: Sequence[ImageTerm]) -> float:
-    """Return how many of its sigmas, as they are now, the typical image scatters; 1 if none shows it."""
-    found = [one.square for _, one in scattering(problem, state, images).values()]
-    return float(np.sqrt(np.median(found))) if found else 1.0
-
-
 def print_error_m(problem: Adjustment, state: Estimate) -> float:
     """Return how far the typical corner is printed beside its place on the board, metres an axis.
 
@@ -150,6 +155,35 @@ def print_error_m(problem: Adjustment, state: Estimate) -> float:
     if not known or chdtrc(2 * len(known), agree) >= Level.STATED:
         return 0.0
     return float(np.sqrt((agree - 2 * len(known)) / sum(float(np.trace(matrix)) for matrix, _ in known)))
+
+
+def wrong_dots(images: Sequence[ImageTerm]) -> tuple[dict[str, np.ndarray], tuple[Outlier, ...]]:
+    """Return by image which dots (n,) disagree with the rest of it (where any do), and these by name.
+
+    Where an image's typical dot is farther off than its sigma, its limit is wider by as much. Where too many
+    are beyond it, it is not the dots that are wrong.
+    """
+    wrong, outliers = dict[str, np.ndarray](), list[Outlier]()
+    for image in images:
+        found = next((rest for fewest, *rest in BLUNDER_DEGREES if len(image.keep) >= fewest), None)
+        if found is None:
+            continue
+        degree, gross = found
+        sigma_px = np.hypot(image.sigma_px, POLYNOMIAL_PX)
+        statistic, off_px = off_smooth(image.in_board_m[:, :2], image.pixels_px, sigma_px, int(degree))
+        limit = gross**2 * at_least_stated(statistic)
+        bad = np.asarray(statistic > limit)
+        if bad.any() and bad.mean() <= MANY:
+            wrong[image.name] = bad
+            for i in np.flatnonzero(bad):
+                name = f"image {image.name} {image.part(int(i))}"
+                outliers.append(Outlier("dot", name, float(statistic[i]), limit, float(off_px[i])))
+    return wrong, tuple(outliers)
+
+
+def without_wrong(image: ImageTerm, wrong: dict[str, np.ndarray]) -> ImageTerm:
+    """Return an image of which wrong dots do not count."""
+    return replace(image, keep=image.keep & ~wrong[image.name]) if image.name in wrong else image
 
 
 def off_smooth(

@@ -21,15 +21,20 @@ from calib.adjust.gross import gross_limit
 from calib.adjust.hypotheses import ScoredFit, find_change, find_drifts
 from calib.adjust.model_terms import ModelTerm, candidate_terms, choose_terms, term_numbers
 from calib.adjust.result import BenchCalibration
-from calib.adjust.robust import SurveyNotFitted, judged_again, weigh, weighed_fields, without_blunders
-from calib.adjust.scatter import print_error_m, with_scales
+from calib.adjust.robust import (
+    SurveyNotFitted,
+    judged_again,
+    refuse_far,
+    weigh,
+    weighed_fields,
+    without_blunders,
+)
+from calib.adjust.scatter import print_error_m, with_scales, without_wrong, wrong_dots
 from calib.adjust.solver import minimise
 from calib.adjust.terms import ImageTerm, with_kept
 from calib.adjust.unknowns import Estimate
-from calib.calibrate.refusals import refuse_far
 from calib.calibrate.starts.bench import BenchNotFitted, SomethingChanged, bench_start, best_cut
 from calib.calibrate.starts.views import ViewPoses, ViewsTooFew, view_poses
-from calib.calibrate.starts.wrong_dots import without_wrong, wrong_dots
 from calib.geometry.rigid import Rigid
 from calib.geometry.significance import Level
 from calib.survey.records import Survey

@@ -24,13 +24,13 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from calib.adjust.adjustment import Adjustment
-from calib.adjust.outliers import Outlier
+from calib.adjust.gross import Outlier
 from calib.adjust.result import Calibration, ImageResiduals
 from calib.adjust.solver import covariance_of
 from calib.adjust.terms import ImageTerm, StationTerm
 from calib.adjust.uncertainty import fitted_fields, image_residuals, open_directions, station_fields
 from calib.adjust.unknowns import MAST, Estimate
-from calib.calibrate.starts.mast import References
+from calib.calibrate.starts.cameras import References
 from calib.calibrate.starts.survey import Start, start_values
 from calib.geometry.rigid import FloatArray
 from calib.geometry.significance import Level

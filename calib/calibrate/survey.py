@@ -23,11 +23,18 @@ from calib.adjust.hypotheses import (
     survey_findings,
 )
 from calib.adjust.result import Calibration
-from calib.adjust.robust import Cleaned, SurveyNotFitted, Weighed, weigh, weighed_fields, without_blunders
+from calib.adjust.robust import (
+    Cleaned,
+    SurveyNotFitted,
+    Weighed,
+    refuse_far,
+    weigh,
+    weighed_fields,
+    without_blunders,
+)
 from calib.adjust.solver import minimise
 from calib.adjust.uncertainty import station_fields
 from calib.adjust.unknowns import Estimate
-from calib.calibrate.refusals import refuse_far
 from calib.calibrate.starts.survey import Start, start_values
 from calib.geometry.significance import Level
 from calib.survey.records import Survey

@@ -18,7 +18,7 @@ from calib.calibrate import paper as fit_paper
 from calib.calibrate import survey as fit_joint
 from calib.calibrate.starts import agreeing
 from calib.calibrate.starts.agreeing import Agreed
-from calib.calibrate.starts.mast import References, fit_mast
+from calib.calibrate.starts.cameras import References, fit_mast
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig

@@ -13,11 +13,11 @@ from calib.calibrate.body import (
     PRIOR_SHIFT_M,
     PRIOR_TURN_RAD,
     BodyPose,
+    body_groups,
     corrected_covariance,
     corrected_rig,
     fit_body_pose,
 )
-from calib.calibrate.body_sights import body_groups
 from calib.errors import NoCorrection
 from calib.files.mast_file import StoredRig
 from calib.geometry.covariance import stored_covariance

@@ -4,8 +4,13 @@ Each step takes the one before as exact, as the paper does, and is robust: a pri
 its drawing is left out of the start, and so is an image that belongs to another board. The fit's own test
 judges again all that is left out here.
 
-Cameras start from their rough focal length and the surveyed points alone (``calib.calibrate.starts.camera``).
-A camera's rough place and direction are not used: they help to find dots (``calib.survey.find_dots``) and to
+"If the CAD model of the prism positions is inaccurate, it needs to be refined iteratively at different total
+station locations" (paper section III.B): here all set-ups and the drawing are one least-squares problem, a
+generalised Procrustes alignment with the drawing as prior. The drawing also defines the rover frame, by the
+mean of its prisms.
+
+Cameras start from their rough focal length and the surveyed points (``calib.calibrate.starts.cameras``). A
+camera's rough place and direction are not used: they help to find dots (``calib.survey.find_dots``) and to
 see what was mixed up (``calib.survey.mixups``), while a fit that needed them would hide that they are wrong.
 """
 
@@ -13,22 +18,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from calib.adjust.adjustment import Adjustment
-from calib.adjust.outliers import Outlier
-from calib.adjust.robust import SurveyNotFitted
+from calib.adjust.gross import Outlier, chance_limit
+from calib.adjust.outliers import name_outliers
+from calib.adjust.robust import SurveyNotFitted, judged
+from calib.adjust.scatter import without_wrong, wrong_dots
 from calib.adjust.terms import ImageTerm, StationTerm, image_terms, station_terms
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.agreeing import Agreed
-from calib.calibrate.starts.camera import fit_camera
-from calib.calibrate.starts.mast import References, fit_mast
-from calib.calibrate.starts.station import StationPoses, station_poses
-from calib.calibrate.starts.wrong_dots import without_wrong, wrong_dots
+from calib.calibrate.starts.cameras import References, fit_camera, fit_mast
 from calib.geometry.rig import MAST_NAMES
-from calib.geometry.rigid import Rigid
-from calib.survey.alignment import NotAligned
+from calib.geometry.rigid import FloatArray, Rigid
+from calib.geometry.significance import Level
+from calib.survey.alignment import Alignment, NotAligned, rover_from_station, station_from_board
 from calib.survey.records import Survey
 
 SAME_ANGLE_RAD = 1e-3
@@ -36,23 +42,102 @@ SAME_ANGLE_RAD = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
+class StationPoses:
+    """Poses of set-ups and boards from prisms and tapes alone.
+
+    ``rover_from_board`` is by set-up and placement, of placements with three tapes; ``bent`` are those whose
+    tapes do not fit the board, ``blunders`` prisms and tapes that the poses were found without.
+    ``prisms_in_rover_m`` is refined where the drawing has a sigma.
+    """
+
+    rover_from_station: Mapping[str, Rigid]
+    rover_from_board: Mapping[tuple[str, str], Rigid]
+    prisms_in_rover_m: Mapping[str, FloatArray]
+    bent: frozenset[tuple[str, str]]
+    blunders: tuple[Outlier, ...]
+    notes: tuple[str, ...]
+
+
+def station_poses(survey: Survey) -> StationPoses:
+    """Return the poses that prisms and tapes give, each placement's alone.
+
+    Set-ups are taken each alone where the drawing of the prisms is exact, else together, as the paper does.
+    Raises NotAligned, naming the set-up or placement whose points are too few or on one line, or if the
+    set-ups stand too differently from the drawing.
+    """
+    alone = rover_from_station(survey, false_alarm=Level.GROSS)
+    notes = [
+        f"the prisms of set-up {setup} do not agree with their CAD positions: {pose.doubt}"
+        for setup, pose in alone.items()
+        if pose.doubt
+    ]
+    setups: Mapping[str, Rigid] = {setup: pose.b_from_a for setup, pose in alone.items()}
+    prisms: Mapping[str, FloatArray] = survey.prisms_in_rover_m
+    if survey.sigma.prism_cad_m > 0:
+        setups, prisms, blunders = _together(survey, alone)
+    else:
+        blunders = [
+            blunder
+            for setup, pose in alone.items()
+            for blunder in _left_out("prism", pose, survey.sigma.station_m, f"of set-up {setup}")
+        ]
+    boards, bent = {}, set()
+    for (setup, placement), pose in station_from_board(survey, false_alarm=Level.GROSS).items():
+        where = f"of placement {placement} (set-up {setup})"
+        boards[setup, placement] = setups[setup] @ pose.b_from_a
+        blunders += _left_out("tape", pose, survey.sigma.station_m, where)
+        if pose.doubt:
+            bent.add((setup, placement))
+            notes.append(f"the tapes {where} do not agree with the board's: {pose.doubt}")
+    return StationPoses(setups, boards, prisms, frozenset(bent), tuple(blunders), tuple(notes))
+
+
+def _together(
+    survey: Survey, alone: Mapping[str, Alignment]
+) -> tuple[Mapping[str, Rigid], Mapping[str, FloatArray], list[Outlier]]:
+    """Set-ups and prisms by all set-ups and the drawing together: an adjustment without images."""
+    off = {(setup, name) for setup, pose in alone.items() for name in pose.rejected}
+    station = [replace(t, keep=(t.setup, t.point) not in off) for t in station_terms(survey, {})]
+    start = Estimate(
+        rover_from_station={setup: pose.b_from_a for setup, pose in alone.items()},
+        prisms_in_rover_m=survey.prisms_in_rover_m,
+    )
+    problem = Adjustment(
+        (),
+        station,
+        start,
+        mast_parameters=0,
+        prisms_cad_m=survey.prisms_in_rover_m,
+        prism_cad_m=survey.sigma.prism_cad_m,
+    )
+    problem, fit = judged(problem, start, ())
+    if not fit.settled:
+        raise NotAligned(
+            f"the prisms' places did not settle in {fit.steps} steps: the set-ups stand too differently from "
+            "the drawing; check the prisms' names and places"
+        )
+    blunders = list(name_outliers(problem, fit.state, fit.covariance, ()))
+    return fit.state.rover_from_station, fit.state.prisms_in_rover_m, blunders
+
+
+def _left_out(kind: Literal["prism", "tape"], pose: Alignment, sigma_m: float, where: str) -> list[Outlier]:
+    """The points that an alignment left out."""
+    limit, found = chance_limit(Level.GROSS, 1, 3), []
+    for name in pose.rejected:
+        off_m = float(np.linalg.norm(pose.residuals_m[pose.names.index(name)]))
+        found.append(Outlier(kind, f"{kind} {name} {where}", (off_m / sigma_m) ** 2, limit, off_m))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
 class Start:
     """Cameras and mast of a survey, each step taken as exact for the next: where the joint fit begins, and
     what the paper's fit is.
 
-    Attributes
-    ----------
-    images, checks, fitted
-        All images with every dot, check images without wrong ones, and the images with those dots that the
-        steps were made with.
-    camera_images
-        Names of the images that cameras were fitted to.
-    references
-        The cameras in the rover frame at the joint setting at which they were calibrated.
-    doubtful
-        Images that did not agree, by name how far off (rms of distances, pixels) they may be.
-    wrong
-        Dots of all images that disagree with the rest of theirs.
+    ``images`` are with every dot, ``fitted`` with those that the steps were made with, ``checks`` without
+    wrong ones. Cameras were fitted to ``camera_images``; ``references`` has them in the rover frame at the
+    joint setting at which they were calibrated. ``doubtful`` says by image that did not agree how far off
+    (rms of distances, pixels) it may be, ``wrong`` are dots that disagree with the rest of their image.
     """
 
     images: tuple[ImageTerm, ...]
@@ -86,10 +171,7 @@ def start_values(survey: Survey, mast_parameters: int, *, by_purpose: bool = Fal
     ``by_purpose`` fits cameras to images of purpose ``camera`` and the mast to those of purpose ``mast``, all
     dots with one weight, as the paper does; else what was taken at one setting, and away from it, counts.
 
-    Raises
-    ------
-    SurveyNotFitted
-        If a set-up, a camera or the mast cannot be started; the sentence says what is missing.
+    Raises SurveyNotFitted if a set-up, a camera or the mast cannot be started, saying what is missing.
     """
     try:
         poses = station_poses(survey)

@@ -16,10 +16,10 @@ import numpy as np
 
 from calib.adjust.adjustment import Adjustment
 from calib.adjust.gross import gross_limit
+from calib.adjust.scatter import without_wrong, wrong_dots
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.agreeing import best_agreeing
-from calib.calibrate.starts.wrong_dots import without_wrong, wrong_dots
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel, Kind
 from calib.geometry.rigid import Rigid

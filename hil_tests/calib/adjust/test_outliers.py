@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.adjust.left_out import LeftOut
-from calib.adjust.outliers import judge
+from calib.adjust.outliers import LeftOut, judge
 from calib.adjust.result import Calibration
 from calib.adjust.robust import SurveyNotFitted
 from calib.adjust.terms import ImageTerm

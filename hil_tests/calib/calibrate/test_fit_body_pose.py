@@ -13,11 +13,12 @@ from calib.calibrate.body import (
     PRIOR_SHIFT_M,
     PRIOR_TURN_RAD,
     BodyPose,
+    body_groups,
+    body_sights,
     corrected_covariance,
     corrected_rig,
     fit_body_pose,
 )
-from calib.calibrate.body_sights import body_groups, body_sights
 from calib.errors import NoCorrection
 from calib.files.mast_file import load_rig
 from calib.geometry.cahvor import CameraModel

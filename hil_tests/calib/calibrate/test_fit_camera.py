@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from calib.adjust.robust import SurveyNotFitted
 from calib.adjust.solver import covariance_of, minimise
 from calib.adjust.terms import ImageTerm, lens_notes
-from calib.calibrate.starts import agreeing, camera
+from calib.calibrate.starts import agreeing, cameras
 from calib.calibrate.starts.agreeing import Agreed
-from calib.calibrate.starts.mast import References, fit_mast
+from calib.calibrate.starts.cameras import References, fit_mast
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.parameters import parameter_part
 from calib.geometry.rig import Rig, RigCamera
@@ -69,7 +69,7 @@ def fit_camera(
             )
         )  # fmt: skip
     boards = {t.board: Rigid.identity() for t in terms}
-    return camera.fit_camera(terms, boards, expected_px=sigma_px, **camera_is)
+    return cameras.fit_camera(terms, boards, expected_px=sigma_px, **camera_is)
 
 
 def model_of(fit: Agreed) -> CameraModel:

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.adjust.outliers import Outlier
+from calib.adjust.gross import Outlier
+from calib.adjust.scatter import wrong_dots
 from calib.adjust.terms import image_terms
 from calib.calibrate.paper import fit_paper
-from calib.calibrate.starts.station import station_poses
-from calib.calibrate.starts.wrong_dots import wrong_dots
+from calib.calibrate.starts.survey import station_poses
 from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
 from calib.survey.records import Survey

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.adjust.goodness import Component
-from calib.adjust.outliers import Outlier
+from calib.adjust.gross import Outlier
 from calib.adjust.result import Calibration, Degenerate
 from calib.adjust.robust import SurveyNotFitted
 from calib.calibrate.paper import fit_paper

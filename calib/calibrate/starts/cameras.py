@@ -1,13 +1,18 @@
-"""Fit the mast to images at many joint angles, with cameras known at one (paper section III.C, eq. (9)).
+"""Where fits of cameras to surveyed boards start, and then that of the mast (paper section III.C, eq. (9)).
 
-Each head camera is known in the rover frame at its own reference angles, and hangs on the very mast that is
-fitted: the mast carries it there. Pan and tilt offsets are gauges (see the errata to the paper) and never
-fitted.
+A camera starts from a rough focal length alone: each image by itself says where a pinhole of it (equidistant
+for a fish-eye) stood before its board. Of these places that which most points of all images agree with is
+taken: images of another board lose. Least squares of all that is free about the camera follows, the boards
+taken as exact.
+
+The mast is fitted to images at many joint angles. Each head camera is known in the rover frame at its own
+reference angles, and hangs on the very mast that is fitted: the mast carries it there. Pan and tilt offsets
+are gauges (see the errata to the paper) and never fitted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,17 +23,93 @@ from calib.adjust.robust import SurveyNotFitted
 from calib.adjust.solver import Normal
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import MAST, Estimate
-from calib.calibrate.starts.agreeing import Agreed, best_agreeing
-from calib.geometry.cahvor import CameraModel
+from calib.calibrate.starts.agreeing import Agreed, best_agreeing, thinned
+from calib.calibrate.starts.views import centred_camera, poses_of
+from calib.geometry.cahvor import CameraModel, Kind
 from calib.geometry.parameters import carried_errors, twist_rates
 from calib.geometry.rig import gimbal, mast_of
 from calib.geometry.rigid import FloatArray, Rigid, crossed
+
+FOCAL_FACTORS = (1.0, 0.85, 1.18)
+"""Times the rough focal length: starts tried in turn until one fits."""
+
+POINTS_OF_IMAGE = 16
+"""Points of each image that a start is made of."""
 
 LEAN_STARTS_RAD = ((0.0, 0.0), (0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3))
 """θx and θy of the starts tried in turn, until one fits."""
 
 HEIGHT_STARTS_M = (0.0, 0.2, -0.2)
 """Where the head's origin may be below the mean of its cameras, metres."""
+
+
+def fit_camera(
+    images: Sequence[ImageTerm],
+    boards: Mapping[tuple[str, str], Rigid],
+    *,
+    kind: Kind,
+    size_px: tuple[int, int],
+    focal_px: float,
+    expected_px: float,
+) -> Agreed:
+    """Fit a camera that stood still to images of boards whose poses are known, in the boards' frame.
+
+    The focal length may be some 20 % off. A CAHVORE is fitted as a fish-eye (type 2), and as type 1 if that
+    does not fit. A fit that leaves more than six times ``expected_px``, of a coordinate, is refused.
+
+    Raises SurveyNotFitted if the images do not fix a camera, or none fits.
+    """
+    name, points = images[0].camera, sum(int(t.keep.sum()) for t in images)
+    if points < 8 or len({t.board for t in images}) < 2:
+        raise SurveyNotFitted(
+            f"camera {name} sees {points} points of {len({t.board for t in images})} boards where at least 8 "
+            "points of 2 boards, better 8 boards, are expected: take more images of boards at two distances "
+            "without moving the head"
+        )
+    still = [replace(t, attitude=None) for t in images]
+
+    def start(model: CameraModel) -> tuple[Adjustment, Estimate]:
+        state = Estimate({name: model}, rover_from_board=boards)
+        return Adjustment(still, (), state, mast_parameters=0, fixed=tuple(boards)), state
+
+    best = best_agreeing(map(start, _camera_starts(still, boards, kind, size_px, focal_px)), expected_px)
+    if best is None or best.typical_px > GROSS * expected_px:
+        how = (
+            "no start led to a camera at which the fit settled"
+            if best is None
+            else f"the best one leaves {best.typical_px:.1f} px"
+        )
+        raise SurveyNotFitted(
+            f"camera {name}: no {kind} camera explains the points: {how} where some {expected_px:.2g} px are "
+            "expected; check the focal length and which placement each image belongs to"
+        )
+    return best
+
+
+def _camera_starts(
+    images: Sequence[ImageTerm],
+    boards: Mapping[tuple[str, str], Rigid],
+    kind: Kind,
+    size_px: tuple[int, int],
+    focal_px: float,
+) -> Iterator[CameraModel]:
+    """Cameras to start from: for each type of lens and focal length the pose that most points agree with."""
+    few = [thinned(t, POINTS_OF_IMAGE) for t in images]
+    points_m = np.concatenate([boards[t.board].points(t.in_board_m[t.keep]) for t in few])
+    pixels_px = np.concatenate([t.pixels_px[t.keep] for t in few])
+
+    def typical_px(model: CameraModel) -> float:
+        off_px = np.linalg.norm(model.project(points_m)[0] - pixels_px, axis=1)
+        return float(np.median(np.nan_to_num(off_px, nan=np.inf)))
+
+    for number in (2, 1) if kind == "CAHVORE" else (0,):
+        for factor in FOCAL_FACTORS:
+            rough = centred_camera(kind, size_px, factor * focal_px, number)
+            placed = [
+                rough.moved(boards[t.board] @ pose.inverse) for t in few for _, pose in poses_of(rough, t)
+            ]
+            if placed:
+                yield min(placed, key=typical_px)
 
 
 class References:
@@ -100,10 +181,7 @@ def fit_mast(
     (θx = θy = 0) and need not explain anything: no image is left out and no fit refused. ``expected_px`` is
     the residual of a coordinate to expect.
 
-    Raises
-    ------
-    SurveyNotFitted
-        If no start leads to a mast at which the fit settles and that explains most images.
+    Raises SurveyNotFitted if no start leads to a mast at which the fit settles and that explains most images.
     """
     if not images:
         raise SurveyNotFitted(
@@ -117,7 +195,7 @@ def fit_mast(
         return problem, state
 
     upright = mast_parameters == 4
-    best = best_agreeing(map(start, _starts(images, references, upright)), expected_px, keep_all=upright)
+    best = best_agreeing(map(start, _mast_starts(images, references, upright)), expected_px, keep_all=upright)
     if best is None:
         raise SurveyNotFitted(
             "mast: no start led to a mast at which the fit settled; check pan and tilt "
@@ -132,7 +210,7 @@ def fit_mast(
     return best
 
 
-def _starts(images: Sequence[ImageTerm], references: References, upright: bool) -> list[FloatArray]:
+def _mast_starts(images: Sequence[ImageTerm], references: References, upright: bool) -> list[FloatArray]:
     """Upright and leaning masts with the head's origin near the cameras."""
     x, y, z = np.mean([references.in_rover[t.camera].C for t in images], axis=0)
     return [
