@@ -10,7 +10,7 @@ import errno
 import hashlib
 import os
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -29,8 +29,6 @@ LARGEST_COMPONENT = 1e9
 LARGEST_IMAGE_PX = 65536
 #: A lens with no ray in more than this part of its image is refused; a fisheye's corners often have none.
 MOST_BLIND = 0.5
-JPEG_SCAN = 0xDA
-JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,22 +78,6 @@ def open_plain(path: str | Path) -> BinaryIO:
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
         raise OSError(errno.EINVAL, "it is a pipe or a device; a plain file is expected")
     return os.fdopen(descriptor, "rb")
-
-
-def jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
-    """Yield the marker of each segment of a JPEG up to its first scan, and where what it holds begins.
-
-    ISO 10918-1, B.1.1.
-    """
-    at = 2
-    while at + 10 <= len(data) and data[at] == 0xFF:
-        if data[at + 1] == 0xFF:  # fills up
-            at += 1
-            continue
-        yield data[at + 1], at + 4
-        if data[at + 1] == JPEG_SCAN:
-            return
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
 
 
 def text_of(data: bytes, path: str | Path) -> str:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import re
+import struct
 import zlib
+from collections.abc import Iterator
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.files import JPEG_SCAN, jpeg_segments
-
 PNG_BEGINS = b"\x89PNG\r\n\x1a\n"
+JPEG_SCAN = 0xDA
+JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
 """Grey, all bits of a sample, and not turned as a camera's tag may ask."""
 
@@ -74,3 +76,39 @@ def spoiled_png(data: bytes) -> str | None:
             return None
         at = end + 4
     return "it is cut short"
+
+
+def picture_size_px(data: bytes) -> tuple[int, int] | None:
+    """Return (width, height); None where the bytes are no whole picture.
+
+    PNG and JPEG say it in their heads; others, such as TIFF, PGM and BMP, are decoded.
+    """
+    if data.startswith(PNG_BEGINS) and data[12:16] == b"IHDR" and len(data) >= 24:
+        return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    if data.startswith(b"\xff\xd8"):
+        for marker, at in jpeg_segments(data):
+            if marker in JPEG_FRAMES:  # ISO 10918-1, B.2.2: precision, height, width
+                height, width = struct.unpack_from(">HH", data, at + 1)
+                return width, height
+        return None
+    try:
+        height, width = decode_picture(data).shape[:2]
+    except ValueError:
+        return None
+    return width, height
+
+
+def jpeg_segments(data: bytes) -> Iterator[tuple[int, int]]:
+    """Yield the marker of each segment of a JPEG up to its first scan, and where what it holds begins.
+
+    ISO 10918-1, B.1.1.
+    """
+    at = 2
+    while at + 10 <= len(data) and data[at] == 0xFF:
+        if data[at + 1] == 0xFF:  # fills up
+            at += 1
+            continue
+        yield data[at + 1], at + 4
+        if data[at + 1] == JPEG_SCAN:
+            return
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")

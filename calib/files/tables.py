@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -54,7 +55,7 @@ def parse_table(data: bytes, path: str | Path, columns: Sequence[str]) -> FloatA
                 continue
             except ValueError:
                 pass
-        values.append(_row(cells, path, f"row {len(values) + 1} (line {line})", columns))
+        values.append(_numbers(TableRow(path, f"row {len(values) + 1} (line {line})", columns, cells)))
     return np.array(values, dtype=np.float64).reshape(len(values), len(columns))
 
 
@@ -120,18 +121,62 @@ def check_header(
     return found
 
 
-def _row(cells: Sequence[str], path: str | Path, place: str, columns: Sequence[str]) -> list[float]:
-    """Read one row's numbers."""
-    if len(cells) != len(columns):
-        hint = ""
-        for delimiter, name in _OTHER_DELIMITERS.items():
-            if len(cells) == 1 and delimiter in cells[0]:
-                hint = f", separated by ',' and not by {name}"
-        raise BadFile(path, place, f"{len(cells)} cells where {len(columns)} are expected{hint}")
-    texts = [cell.strip() for cell in cells]
-    if not any(texts):
-        return [np.nan] * len(texts)
-    for text, column in zip(texts, columns, strict=True):
-        if not NUMBER.fullmatch(text):
-            raise BadFile(path, f"{place}, {column}", f"'{text[:40]}' where a number is expected")
-    return [float(text) for text in texts]
+class TableRow:
+    """One row of a table; ``place`` names it in refusals. Blanks around a cell go.
+
+    Raises BadFile where there are more or fewer cells than columns.
+    """
+
+    def __init__(self, path: str | Path, place: str, columns: Sequence[str], cells: Sequence[str]) -> None:
+        self.path, self.place = path, place
+        if len(cells) != len(columns):
+            hint = ""
+            for delimiter, name in _OTHER_DELIMITERS.items():
+                if len(cells) == 1 and delimiter in cells[0]:
+                    hint = f", separated by ',' and not by {name}"
+            raise self.bad("", f"{len(cells)} cells where {len(columns)} are expected{hint}")
+        self.cells = dict(zip(columns, map(str.strip, cells), strict=True))
+
+    def bad(self, column: str, reason: str) -> BadFile:
+        """Return the refusal of a cell, or of the whole row for the column ''."""
+        return BadFile(self.path, f"{self.place}, {column}" if column else self.place, reason)
+
+    def text(self, column: str) -> str:
+        """Return a cell that must not be empty."""
+        cell = self.cells[column]
+        if not cell:
+            raise self.bad(column, "is empty; a name is expected")
+        if not cell.isprintable():
+            raise self.bad(column, f"{cell[:40]!r} where printable text is expected")
+        return cell
+
+    def choice(self, column: str, choices: Sequence[str], what: str) -> str:
+        """Return a cell that must be one of the choices; ``what`` says what these are."""
+        cell = self.text(column)
+        if cell not in choices:
+            raise self.bad(column, f"'{cell[:40]}' is no {what}; {nearest(cell, list(choices))}")
+        return cell
+
+    def number(self, column: str, limit: float = math.inf) -> float:
+        """Return a cell that must be a number, a finite one of at most ``limit`` in size if that is given."""
+        cell = self.cells[column]
+        if not NUMBER.fullmatch(cell):
+            raise self.bad(column, f"'{cell[:40]}' where a number is expected")
+        value = float(cell)
+        if math.isfinite(limit) and not abs(value) <= limit:
+            raise self.bad(column, f"{cell[:40]} where a finite number up to {limit:g} is expected")
+        return value
+
+    def index(self, column: str, count: int) -> int:
+        """Return a cell that must be an integer from 0 to count - 1."""
+        value = self.number(column, 1e9)
+        if value != int(value) or not 0 <= value < count:
+            cell = self.cells[column][:40]
+            raise self.bad(column, f"{cell} where an integer from 0 to {count - 1} is expected")
+        return int(value)
+
+
+def _numbers(row: TableRow) -> list[float]:
+    if not any(row.cells.values()):
+        return [math.nan] * len(row.cells)
+    return [row.number(column) for column in row.cells]

@@ -7,20 +7,21 @@ measured.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, cast
+from typing import Annotated, Literal, cast
 
 import numpy as np
 from pydantic import AfterValidator, Field, RootModel, model_validator
 
 from calib.errors import BadFile
+from calib.files import digest_of, open_plain, read_bytes, text_of
 from calib.files.mast_file import CameraName, SensorModeRecord, SizePx, StereoRecord, sensor_mode_of
 from calib.files.records import ABSENT, Record, Text, Vector, parse_record, problem
-from calib.files.yaml_text import nearest, parse_mapping
+from calib.files.tables import TableRow, check_header, csv_rows
+from calib.files.yaml_text import MAX_BYTES, nearest, parse_mapping
 from calib.geometry.cahvor import Kind
 from calib.geometry.rigid import FloatArray, frozen_array
-from calib.survey.folder import Once, SurveyFolder, TableRow
 from calib.survey.records import (
     Approach,
     Click,
@@ -45,6 +46,10 @@ BENCH_IMAGE_COLUMNS = ("image", "camera", "placement", "board", "purpose", "pan_
 APPROACH_COLUMNS = ("pan_approach", "tilt_approach")
 CORNER_COLUMNS = ("image", "board", "id", "x_px", "y_px")
 SIGMA_COLUMN = "sigma_px"
+
+MAX_ROWS, CSV_MAX_BYTES = 2_000_000, 200_000_000
+EDGE_PX = 1.0
+"""How far outside its image a dot or corner may have been found: noise at the border."""
 
 FURTHEST_M, LARGEST_ANGLE_RAD, WORST_SIGMA_PX = 1e5, 1e4, 100.0
 """Beyond these a number is not a measurement; the check of the survey judges unlikely ones."""
@@ -233,11 +238,95 @@ def read_survey(folder: str | Path) -> Survey:
     )
 
 
+class Once:
+    """Refuses what is in a table a second time."""
+
+    def __init__(self) -> None:
+        self._places: dict[tuple[object, ...], str] = {}
+
+    def __call__(self, row: TableRow, what: str, *key: object) -> None:
+        if key in self._places:
+            raise row.bad("", f"{what} is there twice, first on {self._places[key]}")
+        self._places[key] = row.place
+
+
+class SurveyFolder:
+    """One reading of a folder; remembers what it read for the digest."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._digests: dict[str, str] = {}
+
+    def document(self) -> bytes:
+        """Return the bytes of survey.yaml."""
+        if not self.path.is_dir():
+            raise BadFile(self.path, "", "is no folder; a survey is a folder with survey.yaml in it")
+        return self._bytes_of("survey.yaml", MAX_BYTES)
+
+    def _bytes_of(self, name: str, limit_bytes: int) -> bytes:
+        path = self.path / name
+        if not path.exists():
+            raise BadFile(path, "", "is missing; a survey has survey.yaml, station.csv and images.csv")
+        data = read_bytes(path, limit_bytes)
+        self._digests[name] = digest_of(data)
+        return data
+
+    def rows(
+        self,
+        name: str,
+        columns: Sequence[str],
+        may_be_there: Sequence[str] | None = None,
+        required: str = "",
+    ) -> Iterator[tuple[int, TableRow]]:
+        """Yield the line and the cells of a table's rows; none of one that is not there and not required.
+
+        ``columns`` are exactly these in this order; or, with ``may_be_there``, these and any of those, in any
+        order. ``required`` says what the rows are of. Raises BadFile for what is no UTF-8 CSV with such
+        columns, a row of another length, or no rows where they are required.
+        """
+        path = self.path / name
+        if not required and not path.exists():
+            return
+        rows = csv_rows(text_of(self._bytes_of(name, CSV_MAX_BYTES), path), path)
+        header = check_header(next(rows, (1, []))[1], path, columns, may_be_there)
+        line = 0
+        for line, cells in rows:
+            if line > MAX_ROWS:
+                raise BadFile(path, "", f"has more than {MAX_ROWS} lines, the most that is read")
+            yield line, TableRow(path, f"line {line}", header, cells)
+        if required and not line:
+            raise BadFile(path, "", f"has a header and no rows; one for each of {required} is expected")
+
+    def check_picture(self, row: TableRow, file: str, camera: SurveyCamera) -> None:
+        """Refuse a picture of another size, and note its content; one that is missing is for the check."""
+        from calib.files.pictures import picture_size_px  # OpenCV, which numbers do without
+
+        path = self.path / file
+        try:
+            if not path.is_file():
+                return
+            with open_plain(path) as stream:
+                data = stream.read()
+            size_px = picture_size_px(data)
+            self._digests[file] = digest_of(data)
+        except (OSError, ValueError) as error:
+            raise row.bad("file", f"'{file[:60]}' cannot be read: {error}") from None
+        if size_px is not None and size_px != camera.size_px:
+            found, wanted = ("x".join(map(str, size)) for size in (size_px, camera.size_px))
+            raise row.bad("file", f"{file} is {found} pixels where {camera.name} of survey.yaml has {wanted}")
+
+    def digest(self) -> str:
+        """Return the SHA-256 over names and contents of all that was read."""
+        listing = "".join(f"{digest}  {name}\n" for name, digest in sorted(self._digests.items()))
+        return digest_of(listing.encode("utf-8", "surrogatepass"))
+
+
 def _station(read: SurveyFolder, board: Board, prisms: Mapping[str, FloatArray]) -> tuple[StationPoint, ...]:
     points: list[StationPoint] = []
     once = Once()
     known = {"prism": tuple(prisms), "tape": tuple(board.tapes_in_board_m)}
-    for row in read.rows("station.csv", STATION_COLUMNS, required=True):
+    of_what = "the prisms and tapes that were measured"
+    for line, row in read.rows("station.csv", STATION_COLUMNS, required=of_what):
         setup = row.text("setup")
         kind = row.choice("kind", ("prism", "tape", "check"), "kind of point")
         placement = row.text("placement") if kind == "tape" else row.cells["placement"]
@@ -249,8 +338,7 @@ def _station(read: SurveyFolder, board: Board, prisms: Mapping[str, FloatArray])
         where = f"placement {placement} in " if placement else ""
         once(row, f"{kind} {point} of {where}set-up {setup}", setup, kind, placement, point)
         position_m = frozen_array([row.number(column, FURTHEST_M) for column in ("x_m", "y_m", "z_m")], (3,))
-        points.append(StationPoint(setup, cast(StationKind, kind), placement, point, position_m, row.line))
-    _refuse_empty(points, read, "station.csv", "the prisms and tapes that were measured")
+        points.append(StationPoint(setup, cast(StationKind, kind), placement, point, position_m, line))
     return tuple(points)
 
 
@@ -265,8 +353,8 @@ def _images(
     if boards:
         rows = read.rows("images.csv", BENCH_IMAGE_COLUMNS, ("setup", *APPROACH_COLUMNS))
     else:
-        rows = read.rows("images.csv", IMAGE_COLUMNS, required=True)
-    for row in rows:
+        rows = read.rows("images.csv", IMAGE_COLUMNS, required="the images that were taken")
+    for line, row in rows:
         name = row.text("image")
         once(row, f"image {name}", name)
         camera = cameras[row.choice("camera", tuple(cameras), "camera of survey.yaml")]
@@ -293,24 +381,17 @@ def _images(
                 pan_rad,
                 tilt_rad,
                 Path(file),
-                row.line,
+                line,
                 board,
                 *(_approach(row, column, camera) for column in APPROACH_COLUMNS),
             )
         )
-    if not boards:
-        _refuse_empty(images, read, "images.csv", "the images that were taken")
     return tuple(images)
-
-
-def _refuse_empty(rows: list[Any], read: SurveyFolder, name: str, what: str) -> None:
-    if not rows:
-        raise BadFile(read.path / name, "", f"has a header and no rows; one for each of {what} is expected")
 
 
 def _joint_rad(row: TableRow, column: str, camera: SurveyCamera) -> float | None:
     """Read an angle, which a head camera has and one on the body has not."""
-    row.none_on_body(column, camera)
+    _refuse_on_body(row, column, camera)
     if camera.on == "rover":
         return None
     if not row.cells[column]:
@@ -318,10 +399,27 @@ def _joint_rad(row: TableRow, column: str, camera: SurveyCamera) -> float | None
     return row.number(column, LARGEST_ANGLE_RAD)
 
 
+def _refuse_on_body(row: TableRow, column: str, camera: SurveyCamera) -> None:
+    """Refuse a joint's cell that is not empty for a camera on the body."""
+    cell = row.cells.get(column, "")
+    if camera.on == "rover" and cell:
+        raise row.bad(column, f"'{cell[:40]}' where nothing is expected: {camera.name} is on the body")
+
+
+def _pixel(row: TableRow, camera: SurveyCamera) -> tuple[float, float]:
+    """Read ``x_px`` and ``y_px``, which must be inside the camera's image."""
+    pixel = row.number("x_px", 1e9), row.number("y_px", 1e9)
+    for column, value, size in zip(("x_px", "y_px"), pixel, camera.size_px, strict=True):
+        if not -0.5 - EDGE_PX <= value <= size - 0.5 + EDGE_PX:
+            shape = "x".join(map(str, camera.size_px))
+            raise row.bad(column, f"{value:g} is outside the image of {camera.name}, {shape} pixels")
+    return pixel
+
+
 def _approach(row: TableRow, column: str, camera: SurveyCamera) -> Approach:
     """Read from which side a joint came to rest."""
     cell = row.cells.get(column, "")
-    row.none_on_body(column, camera)
+    _refuse_on_body(row, column, camera)
     value = row.number(column, 1.0) if cell else 0.0
     if value not in (-1.0, 0.0, 1.0):
         raise row.bad(column, f"{cell[:40]} where -1, 0 or 1 is expected")
@@ -343,14 +441,14 @@ def _corners(
     found: dict[str, list[tuple[float, ...]]] = {}
     once = Once()
     counts = {name: len(board.ids) for name, board in boards.items()}
-    for row in read.rows("corners.csv", CORNER_COLUMNS, (SIGMA_COLUMN,)):
+    for _, row in read.rows("corners.csv", CORNER_COLUMNS, (SIGMA_COLUMN,)):
         image = _image(row, images)
         board = row.choice("board", tuple(boards), "board of survey.yaml")
         if board != image.board:
             raise row.bad("board", f"'{board}' where image {image.name} of images.csv shows {image.board}")
         number = row.index("id", counts[board])
         once(row, f"corner {number} of image {image.name}", image.name, number)
-        pixel, sigma_px = row.pixel(cameras[image.camera]), corner_px
+        pixel, sigma_px = _pixel(row, cameras[image.camera]), corner_px
         if row.cells.get(SIGMA_COLUMN):
             sigma_px = row.number(SIGMA_COLUMN, WORST_SIGMA_PX)
             if sigma_px <= 0:
@@ -365,11 +463,11 @@ def _dots(
 ) -> dict[str, Dots]:
     found: dict[str, list[tuple[float, ...]]] = {}
     once = Once()
-    for row in read.rows("dots.csv", DOT_COLUMNS):
+    for _, row in read.rows("dots.csv", DOT_COLUMNS):
         image = _image(row, images)
         place = row.index("row", board.rows), row.index("column", board.columns)
         once(row, f"dot {place} of image {image.name}", image.name, place)
-        found.setdefault(image.name, []).append((*place, *row.pixel(cameras[image.camera])))
+        found.setdefault(image.name, []).append((*place, *_pixel(row, cameras[image.camera])))
     tables = {name: np.array(rows) for name, rows in found.items()}
     indices = {name: t[:, :2].astype(np.int64) for name, t in tables.items()}
     return {name: Dots(at[:, 0], at[:, 1], tables[name][:, 2:]) for name, at in indices.items()}
@@ -384,12 +482,12 @@ def _clicks(
     checks = {(point.setup, point.point) for point in station if point.kind == "check"}
     clicks: list[Click] = []
     once = Once()
-    for row in read.rows("clicks.csv", CLICK_COLUMNS):
+    for _, row in read.rows("clicks.csv", CLICK_COLUMNS):
         image, point = _image(row, images), row.text("point")
         if (image.setup, point) not in checks:
             known = sorted(other for where, other in checks if where == image.setup)
             there = nearest(point, known) if known else "it has none"
             raise row.bad("point", f"'{point[:40]}' is no check point of set-up {image.setup}; {there}")
         once(row, f"point {point} of image {image.name}", image.name, point)
-        clicks.append(Click(image.name, point, frozen_array(row.pixel(cameras[image.camera]), (2,))))
+        clicks.append(Click(image.name, point, frozen_array(_pixel(row, cameras[image.camera]), (2,))))
     return tuple(clicks)

@@ -241,7 +241,7 @@ def _checks(fit: Calibration | BenchCalibration) -> list[Reason]:
 def _turned(fit: Calibration) -> list[Reason]:
     """Whether the mast is turned about: a tilt that counts down fits as well, with the head half a turn off.
 
-    `calib.survey.mixups` mostly refuses such a survey before.
+    `calib.survey.diagnoses` mostly refuses such a survey before.
     """
     angle = float(np.linalg.norm(Rotation.from_euler("XYZ", fit.rig.mast.rotation_rad).as_rotvec()))
     if angle < TURNED_RAD:

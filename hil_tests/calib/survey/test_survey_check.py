@@ -91,14 +91,11 @@ def test_an_image_of_a_placement_that_was_not_measured(good: Survey) -> None:
     assert str(one.row) in finding.place
 
 
-def test_a_placement_with_two_tapes_and_one_that_is_not_seen(good: Survey) -> None:
+def test_a_placement_with_two_tapes(good: Survey) -> None:
     changed = with_station(good, lambda p: None if (p.placement, p.point) == ("mast-1", "c") else p)
-    changed = with_images(changed, lambda i: None if i.placement == "check-2" else i)
-    few, unseen = check_survey(changed)
+    few = only(check_survey(changed))
     assert few.severity == "error"
     assert "2 of three tapes are measured (a, b)" in few.message
-    assert unseen.severity == "warning"
-    assert "check-2" in unseen.place
 
 
 @pytest.mark.parametrize(("left", "severity"), [(2, "error"), (3, "warning")])
@@ -129,30 +126,6 @@ def test_boards_at_one_distance(good: Survey) -> None:
     assert "m as well" in findings[0].advice
 
 
-def test_dots_in_one_part_of_the_picture(good: Survey) -> None:
-    dots = {
-        n: replace(d, pixels_px=d.pixels_px * (0.3, 1) + (1, 0)) if n.startswith("navcam_left") else d
-        for n, d in good.dots.items()
-    }
-    findings = [f for f in check_survey(replace(good, dots=dots)) if "of the picture" in f.message]
-    finding = only(tuple(findings))
-    assert finding.advice == "Photograph boards in the right part of the picture"
-    assert "x " in finding.message
-
-
-def test_dots_in_one_column_of_cells_lead_to_the_half_that_has_none(good: Survey) -> None:
-    """All dots right of the middle and left of the last quarter: 0 % of the left half, 50 % of the right."""
-    size_px = np.array(good.cameras["navcam_left"].size_px)
-    dots = {
-        n: replace(d, pixels_px=d.pixels_px * (0.2, 1) + (0.52 * size_px[0], 0))
-        if n.startswith("navcam_left")
-        else d
-        for n, d in good.dots.items()
-    }
-    finding = only(tuple(f for f in check_survey(replace(good, dots=dots)) if "of the picture" in f.message))
-    assert finding.advice == "Photograph boards in the left part of the picture"
-
-
 def test_few_boards(good: Survey) -> None:
     kept = {i.placement for i in good.images if i.camera == "hazcam_left" and i.purpose == "camera"}
     for count, severity in ((2, "error"), (3, "warning"), (4, "warning")):
@@ -170,17 +143,6 @@ def test_a_head_that_hardly_moved(good: Survey) -> None:
     unmoved = with_images(still, lambda i: replace(i, pan_rad=0.0) if i.pan_rad is not None else i)
     errors = [f for f in check_survey(unmoved) if f.place == "the mast"]
     assert only(tuple(errors)).severity == "error"
-
-
-def test_only_placements_for_the_mast_count_for_it(good: Survey) -> None:
-    """Four of them, and as many boards for the cameras as there are."""
-    kept = sorted({i.placement for i in good.images if i.purpose == "mast"})[:4]
-    changed = with_images(good, lambda i: i if i.purpose != "mast" or i.placement in kept else None)
-    findings = [f.message for f in check_survey(changed) if f.place == "the mast"]
-    assert [m for m in findings if "of purpose mast" in m] == [
-        "4 placements of purpose mast; 5 to 8 are adequate"
-    ]
-    assert not [f for f in check_survey(good) if "of purpose mast" in f.message]
 
 
 # wrong units
