@@ -11,7 +11,7 @@ mean of its prisms.
 
 Cameras start from their rough focal length and the surveyed points (``calib.calibrate.starts.cameras``). A
 camera's rough place and direction are not used: they help to find dots (``calib.survey.find_dots``) and to
-see what was mixed up (``calib.survey.diagnoses``), while a fit that needed them would hide that they are wrong.
+see what was mixed up (``calib.survey.diagnoses``); a fit that needed them would hide that they are wrong.
 """
 
 from __future__ import annotations
