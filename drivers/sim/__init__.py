@@ -35,7 +35,7 @@ def _device(options: Mapping[str, Any], context: Context) -> PanTilt | Camera:
 
 def _rover(context: Context) -> RoverModel:
     if ROVER not in context.shared:
-        from drivers.sim.rover import RoverModel
+        from drivers.sim.rover import RoverModel  # numba, which takes long to import
         from drivers.sim.settings import simulation_settings
 
         settings = simulation_settings(context.simulation, context.folder)

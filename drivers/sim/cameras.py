@@ -22,9 +22,8 @@ from drivers.clock import Clock
 from drivers.errors import BadSetting, NoFreshFrame, NoReply
 from drivers.faults import Fault, FaultPanel
 from drivers.interfaces import Camera, CameraInfo, CameraSetting, Frame, FrameTime, Image
-from drivers.sim.camera_settings import CameraSettings, ClockSettings, SimulatedCameraClock
-from drivers.sim.optics.exposure import AutoExposure, FixedExposure, FrameExposure
-from drivers.sim.optics.readout import Noise, Readout
+from drivers.sim.sensor import AutoExposure, FixedExposure, FrameExposure, Noise, Readout
+from drivers.sim.settings import CameraSettings, ClockSettings
 
 RING_FRAMES = 4
 """Finished frames that can still be fetched, as in a capture ring of four buffers."""
@@ -37,8 +36,36 @@ SHORTEST_S, LONGEST_SHARE = 1e-5, 0.99
 
 GAINS = 1.0, 64.0
 
+_ROUNDING_S = 1e-9
+"""A frame stamped at the requested moment is not after it, whatever rounding does on the way."""
+
 CHECKED_AGAIN_S = 0.5
 """For a clock that is turned by hand: it wakes no thread."""
+
+
+class SimulatedCameraClock:
+    """Turns true times into stamps and back; both agree at ``start_s`` but for ``stamped_late_s``."""
+
+    def __init__(self, settings: ClockSettings, start_s: float) -> None:
+        self._pace = 1 + 1e-6 * settings.drift_ppm
+        self._drift = 1e-6 * settings.drift_ppm if settings.own_stamps else 0.0
+        self._late_s = settings.stamped_late_s
+        self._start_s = start_s
+        self.first_s = start_s + settings.offset_s
+        """When frame 0 is exposed."""
+
+    def true_period_s(self, period_s: float) -> float:
+        """Return how long a period by this clock truly is."""
+        return period_s / self._pace
+
+    def stamp_s(self, true_s: float) -> float:
+        """Return what stands on a frame of a moment."""
+        return true_s + ((true_s - self._start_s) * self._drift + self._late_s)
+
+    def true_s(self, stamp_s: float) -> float:
+        """Return the moment that a stamp means, and a nanosecond for rounding."""
+        since_s = stamp_s - self._late_s - self._start_s
+        return stamp_s - (since_s * self._drift / (1 + self._drift) + self._late_s) + _ROUNDING_S
 
 
 @dataclass(frozen=True)

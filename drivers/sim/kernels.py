@@ -2,8 +2,8 @@
 
 All compiled functions are in this one file, since numba's cache on disk compares only the file of the
 function that Python calls. Heights inside are *elevations*, up positive (site z is down): e = -z. Lengths
-along a ray are metres because directions are unit vectors. Geometry is float64. `drivers.sim.compiled` loads
-this module.
+along a ray are metres because directions are unit vectors. Geometry is float64.
+Importing this module raises BadOptions if numba is not installed.
 """
 
 from __future__ import annotations
@@ -13,11 +13,17 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar, cast
 
-import numba
 import numpy as np
-from numba.core import cgutils, types
-from numba.extending import intrinsic
 from numpy.typing import NDArray
+
+from drivers.errors import BadOptions
+
+try:
+    import numba
+    from numba.core import cgutils, types
+    from numba.extending import intrinsic
+except ModuleNotFoundError as missing:
+    raise BadOptions("the simulated rover needs numba: pip install 'mastctl[sim]'") from missing
 
 log = logging.getLogger(__name__)
 

@@ -1,4 +1,4 @@
-"""What a configuration puts into the scene: rocks, bricks and boards, checked before anything is built.
+"""What a configuration makes the scene of: ground, sun, rocks, bricks and boards, checked before it is built.
 
 Places are in the site frame (x north, y east), which is the rover frame as long as the rover has not moved.
 """
@@ -237,17 +237,6 @@ def heights_m(thing: Placed) -> tuple[float, float]:
     return thing.raised_m, thing.raised_m + thing.size_m[1] * math.cos(thing.lean_rad)
 
 
-def named(rocks: Any, bricks: Any, boards: Any) -> dict[str, Placed]:
-    """Return all placed things by where they stand in the configuration."""
-    lists = {"rocks": rocks, "bricks": bricks, "boards": boards}
-    return {
-        f"simulation.scene.{kind}[{k}]": thing
-        for kind, things in lists.items()
-        if isinstance(things, tuple)
-        for k, thing in enumerate(things)
-    }
-
-
 def check_apart(things: Mapping[str, Placed]) -> None:
     """Pass things of which none stands in another. Raises BadOptions with the first pair."""
     outlines = {key: footprint_m(thing).astype(np.float32) for key, thing in things.items()}
@@ -287,3 +276,38 @@ def check_clear_of(things: Mapping[str, Placed], rig: Rig) -> None:
 
 def _hull(outline: NDArray[np.float32]) -> Any:
     return cv2.convexHull(outline)
+
+
+class SceneSettings(DriverOptions):
+    """What a scene is made of."""
+
+    seed: Annotated[int, Field(ge=0, le=2**63)] = 1
+    """Of everything that is scattered."""
+    relief_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.15
+    """How far the ground rises and falls about z = 0, metres; 0 gives flat textured ground."""
+    rocks: Annotated[int | tuple[PlacedRock, ...], placed_or("rocks", 500)] = 50
+    """How many stones of 0.05-0.6 m lie 1.5-20 m away within 1.5 rad of north; or just these."""
+    bricks: Annotated[int | tuple[PlacedBrick, ...], placed_or("bricks", 24)] = 0
+    """How many bricks stand ahead, by turns 1.8 m and 6 m away, as far as there is space; or just these."""
+    boards: Annotated[tuple[PlacedBoard, ...], placed_or("boards")] = ()
+    """Boards that stand there. Where one does, or a brick or rock was placed, no scattered one is."""
+    sun_azimuth_rad: Annotated[float, Field(ge=-1e3, le=1e3)] = -1.95
+    """Where the sun stands, from north over east."""
+    sun_elevation_rad: Annotated[float, Field(ge=0.2, le=1.5)] = 0.70
+    """Where the sun stands, above the horizon."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        check_apart(self.placed)
+        return self
+
+    @property
+    def placed(self) -> dict[str, Placed]:
+        """All that was placed, by where it stands in a configuration."""
+        lists: dict[str, Any] = {"rocks": self.rocks, "bricks": self.bricks, "boards": self.boards}
+        return {
+            f"simulation.scene.{kind}[{k}]": thing
+            for kind, things in lists.items()
+            if isinstance(things, tuple)
+            for k, thing in enumerate(things)
+        }

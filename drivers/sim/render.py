@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
 from drivers.errors import BadOptions
-from drivers.sim.compiled import kernels
-from drivers.sim.optics.readout import Noise
+from drivers.sim import kernels
 from drivers.sim.scene import Scene, tiny_scene
+from drivers.sim.sensor import Noise
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -138,7 +138,7 @@ def in_pixels(values: Float32, samples: int) -> Float32:
 def beams(rays: Float32, starts: Float32, samples: int, size_px: int) -> Float64:
     """Return (rows, columns, 6): the mean direction of each square of pixels, and how far its rays spread."""
     table = np.empty((-(-rays.shape[0] // size_px), -(-rays.shape[1] // size_px), 6))
-    kernels().hold_rays(rays, starts, samples, size_px, table)
+    kernels.hold_rays(rays, starts, samples, size_px, table)
     return table
 
 
@@ -150,7 +150,6 @@ class Renderer:
 
     def __init__(self, scene: Scene, workers: int | None = None) -> None:
         self.scene = scene
-        self._kernels = kernels()
         self._workers = workers or os.cpu_count() or 1
         self._pool = ThreadPoolExecutor(self._workers, thread_name_prefix="render")
         self._tables: OrderedDict[tuple[object, ...], RayTable] = OrderedDict()
@@ -177,7 +176,7 @@ class Renderer:
         if not 1 <= samples <= MAX_SAMPLES:
             raise BadOptions(f"{samples} samples across a pixel where 1 to {MAX_SAMPLES} are possible")
         centre_m = np.array(site_from_camera_frame.points(camera.C))
-        if not self._kernels.over_ground(self.scene.world.inner, centre_m[0], centre_m[1], -centre_m[2]):
+        if not kernels.over_ground(self.scene.world.inner, centre_m[0], centre_m[1], -centre_m[2]):
             place = ", ".join(f"{value:.3f}" for value in centre_m)
             raise BadOptions(
                 f"a camera at ({place}) m in the site frame is under the ground or beyond its edge"
@@ -193,7 +192,7 @@ class Renderer:
         edges = np.linspace(first, last, parts + 1).astype(int)
 
         def draw(k: int) -> None:
-            self._kernels.render_tiles(
+            kernels.render_tiles(
                 self.scene.world,
                 *table,
                 TILE_PX,

@@ -6,14 +6,16 @@ Rocks are irregular, nearly convex; bricks are level boxes of exactly known corn
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sim.compiled import kernels
+from drivers.sim import kernels
 
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+GroundHeight = Callable[[float, float], float]
+"""z of the ground at (x, y) of the site frame, metres."""
 
 NEAREST_M = 1.5
 FARTHEST_M = 20.0
@@ -107,18 +109,18 @@ def places(count: int, rng: np.random.Generator) -> Float64:
     return np.array(found, dtype=np.float64).reshape(-1, 3)
 
 
-def make_rocks(count: int, rng: np.random.Generator, ground_z_m: Any) -> Any:
-    """Return ``kernels.Rocks``: ``count`` stones standing on the ground.
-
-    ``ground_z_m(x_m, y_m)`` gives the ground's z in the site frame, metres.
-    """
+def make_rocks(count: int, rng: np.random.Generator, ground_z_m: GroundHeight) -> kernels.Rocks:
+    """Return ``count`` stones standing on the ground."""
     return stones_at(places(count, rng), rng, ground_z_m)
 
 
 def stones_at(
-    where: Float64, rng: np.random.Generator, ground_z_m: Any, headings_rad: Sequence[float] | None = None
-) -> Any:
-    """Return ``kernels.Rocks`` at (n, 3) places and diameters; turned by chance if no heading is given."""
+    where: Float64,
+    rng: np.random.Generator,
+    ground_z_m: GroundHeight,
+    headings_rad: Sequence[float] | None = None,
+) -> kernels.Rocks:
+    """Return rocks at (n, 3) places and diameters; turned by chance if no heading is given."""
     sphere = divided_icosahedron()
     corners = np.empty((len(where), len(sphere), 3, 3))
     normals = np.empty((len(where), len(sphere), 3, 3), dtype=np.float32)
@@ -136,14 +138,18 @@ def stones_at(
         corners[k] = stone + np.array([x, y, float(ground_z_m(x, y)) - low + sunk])
         normals[k] = corner_normals(corners[k])
     tones = np.exp(rng.normal(0.0, 0.16, len(where))).astype(np.float32)
-    return kernels().Rocks(
-        spheres(corners), *(boxes(corners, 4**level) for level in (3, 2, 1)), corners, normals, tones
-    )
+    return meshed(corners, normals, tones)
 
 
-def together(*some: Any) -> Any:
+def meshed(corners_m: Float64, normals: Float32, tones: Float32) -> kernels.Rocks:
+    """Return rocks of meshes (k, 1280, 3, 3) with what bounds them."""
+    balls, bounds = spheres(corners_m), [boxes(corners_m, 4**level) for level in (3, 2, 1)]
+    return kernels.Rocks(balls, bounds[0], bounds[1], bounds[2], corners_m, normals, tones)
+
+
+def together(*some: kernels.Rocks) -> kernels.Rocks:
     """Return the ``kernels.Rocks`` of all."""
-    return kernels().Rocks(*(np.concatenate(parts) for parts in zip(*some, strict=True)))
+    return kernels.Rocks(*(np.concatenate(parts) for parts in zip(*some, strict=True)))
 
 
 def boxes(corners_m: Float64, run: int) -> Float64:
@@ -165,7 +171,7 @@ def make_brick(
     x_m: float,
     y_m: float,
     turn_rad: float,
-    ground_z_m: Callable[[float, float], float],
+    ground_z_m: GroundHeight,
     size_m: tuple[float, float, float] = BRICK_SIZE_M,
 ) -> Float64:
     """Return the corners (8, 3) of a brick of length, width and height about (x, y), site frame, metres.
@@ -182,7 +188,7 @@ def make_brick(
 
 
 def scattered(
-    count: int, rng: np.random.Generator, taken_m: Float64, ground_z_m: Callable[[float, float], float]
+    count: int, rng: np.random.Generator, taken_m: Float64, ground_z_m: GroundHeight
 ) -> list[Float64]:
     """Return up to ``count`` bricks, by turns near and far, apart from each other.
 
@@ -203,7 +209,7 @@ def scattered(
     return found
 
 
-def meshes(bricks: Sequence[Float64]) -> Any:
+def meshes(bricks: Sequence[Float64]) -> kernels.Rocks:
     """Return the ``kernels.Rocks`` of bricks: each a closed mesh of 20 triangles, divided as rocks are."""
     corners = np.array([divided(_triangles(brick), lambda middles: middles) for brick in bricks])
     corners = corners.reshape(len(bricks), -1, 3, 3)
@@ -211,9 +217,7 @@ def meshes(bricks: Sequence[Float64]) -> Any:
     across /= np.linalg.norm(across, axis=-1, keepdims=True)
     normals = np.repeat(across[:, :, None], 3, axis=2).astype(np.float32)
     tones = np.full(len(bricks), BRICK_TONE, dtype=np.float32)
-    return kernels().Rocks(
-        spheres(corners), *(boxes(corners, 4**level) for level in (3, 2, 1)), corners, normals, tones
-    )
+    return meshed(corners, normals, tones)
 
 
 def _triangles(brick: Float64) -> Float64:

@@ -33,17 +33,14 @@ from drivers.errors import BadOptions, NoFreshFrame
 from drivers.faults import FaultPanel, nearest
 from drivers.interfaces import PanTilt
 from drivers.sim.bench_boards import BenchBoard, BenchBoards, checked, facing, placed_board
-from drivers.sim.camera_settings import ClockSettings
 from drivers.sim.cameras import SimulatedCamera
 from drivers.sim.heads import with_joints
-from drivers.sim.kept_scenes import kept_scene
-from drivers.sim.optics.lens import SimulatedLens
-from drivers.sim.optics.shutter import Shutter
+from drivers.sim.optics import Shutter, SimulatedLens
 from drivers.sim.pan_tilt import SimulatedPanTilt, WiredHead
 from drivers.sim.placed import REACH_M, check_clear_of
 from drivers.sim.render import Renderer, Stills, compile_renderer
-from drivers.sim.scene import Scene
-from drivers.sim.settings import SimulationSettings
+from drivers.sim.scene import Scene, kept_scene
+from drivers.sim.settings import ClockSettings, SimulationSettings
 
 TRUTH_FRAMES = 512
 """How many frames of each camera ``frame_truth`` remembers."""

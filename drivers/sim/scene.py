@@ -2,36 +2,34 @@
 
 Site frame: x north, y east, z down, metres. The rover stands at the origin, where the ground is at z = 0.
 An inner grid of 3 cm cells reaches 32 m each way; an outer one of 4 m cells carries low hills to the
-horizon and is level where the two meet.
+horizon and is level where the two meet. Pictures of gravel and stone are halved again and again for distant
+views. A scene that was built is kept on disk, read in no time, its pages shared by all processes.
 """
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import math
+import os
+import shutil
+import tempfile
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated, Any, Self
+from pathlib import Path
+from typing import Any, get_type_hints
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, model_validator
+from scipy import fft
 
 from calib.geometry.rigid import Rigid, rot_x, rot_y, rot_z
-from drivers.options import DriverOptions
-from drivers.sim import ground, rocks
-from drivers.sim.compiled import kernels
-from drivers.sim.placed import (
-    Placed,
-    PlacedBoard,
-    PlacedBrick,
-    PlacedRock,
-    check_apart,
-    middle_m,
-    named,
-    placed_or,
-    radius_m,
-)
+from drivers.sim import kernels, rocks
+from drivers.sim.kept import digest_of, keep_newest, kept_folder
+from drivers.sim.placed import SceneSettings, middle_m, radius_m
 
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 INNER_CELLS = 2048
@@ -43,41 +41,19 @@ ROUGH_BEYOND_M = 2.5  # ...and whole from here on
 HILLS_FROM_M = 70.0
 HILL_M = 9.0
 SHADOW_SAMPLES = 4  # across a ground texel
-
-
-class SceneSettings(DriverOptions):
-    """What a scene is made of."""
-
-    seed: Annotated[int, Field(ge=0, le=2**63)] = 1
-    """Of everything that is scattered."""
-    relief_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.15
-    """How far the ground rises and falls about z = 0, metres; 0 gives flat textured ground."""
-    rocks: Annotated[int | tuple[PlacedRock, ...], placed_or("rocks", 500)] = 50
-    """How many stones of 0.05-0.6 m lie 1.5-20 m away within 1.5 rad of north; or just these."""
-    bricks: Annotated[int | tuple[PlacedBrick, ...], placed_or("bricks", 24)] = 0
-    """How many bricks stand ahead, by turns 1.8 m and 6 m away, as far as there is space; or just these."""
-    boards: Annotated[tuple[PlacedBoard, ...], placed_or("boards")] = ()
-    """Boards that stand there. Where one does, or a brick or rock was placed, no scattered one is."""
-    sun_azimuth_rad: Annotated[float, Field(ge=-1e3, le=1e3)] = -1.95
-    """Where the sun stands, from north over east."""
-    sun_elevation_rad: Annotated[float, Field(ge=0.2, le=1.5)] = 0.70
-    """Where the sun stands, above the horizon."""
-
-    @model_validator(mode="after")
-    def _check(self) -> Self:
-        check_apart(self.placed)
-        return self
-
-    @property
-    def placed(self) -> dict[str, Placed]:
-        """All that was placed, by where it stands in a configuration."""
-        return named(self.rocks, self.bricks, self.boards)
+MAKERS = ("kernels", "placed", "rocks", "scene")  # the modules that a scene depends on
+DETAIL_TEXELS = 4096
+DETAIL_TEXEL_M = 0.001
+STONE_TEXELS = 1024
+STONE_TEXEL_M = 0.001
+# half length of the pebbles in texels (millimetres), and the share of the ground that each class covers
+PEBBLES = ((1.2, 2.5, 0.22), (2.5, 5.0, 0.16), (5.0, 11.0, 0.10), (11.0, 24.0, 0.05), (24.0, 40.0, 0.012))
 
 
 class Scene:
     """Ground, rocks, bricks and light, ready for casting rays; made by ``build_scene``, never changed."""
 
-    def __init__(self, settings: SceneSettings, world: Any) -> None:
+    def __init__(self, settings: SceneSettings, world: kernels.World) -> None:
         self.settings = settings
         self.world = world
 
@@ -102,7 +78,7 @@ class Scene:
         fit &= np.isfinite(origins[:, 2])
         ranges_m = np.full(len(origins), np.nan)
         found = np.empty(int(fit.sum()))
-        kernels().cast_rays(self.world, origins[fit], unit[fit], found)
+        kernels.cast_rays(self.world, origins[fit], unit[fit], found)
         ranges_m[fit] = found
         return ranges_m.reshape(shape)
 
@@ -138,10 +114,9 @@ def build_scene(settings: SceneSettings | None = None) -> Scene:
     if laid:
         stones = rocks.together(stones, rocks.meshes(laid))
     tones = ground_tones(inner, sun, tone_rng) * shadows(inner, stones, sun)
-    detail = ground.pyramid(ground.gravel(gravel_rng, sun, ground.DETAIL_TEXELS), ground.DETAIL_TEXEL_M)
-    stone = ground.pyramid(ground.stone(stone_rng, ground.STONE_TEXELS), ground.STONE_TEXEL_M)
-    broad = ground.pyramid(tones, INNER_CELL_M)
-    world = kernels().World(inner, outer, stones, detail, broad, stone, sun)
+    detail = pyramid(gravel(gravel_rng, sun, DETAIL_TEXELS), DETAIL_TEXEL_M)
+    surface = pyramid(stone(stone_rng, STONE_TEXELS), STONE_TEXEL_M)
+    world = kernels.World(inner, outer, stones, detail, pyramid(tones, INNER_CELL_M), surface, sun)
     return Scene(settings, world)
 
 
@@ -151,7 +126,7 @@ def laid_out(
     brick_rng: np.random.Generator,
     placed_rng: np.random.Generator,
     ground_m: Callable[[float, float], float],
-) -> tuple[Any, list[Float64]]:
+) -> tuple[kernels.Rocks, list[Float64]]:
     """Return ``kernels.Rocks`` of the stones, and the bricks; scattered ones keep away from placed things."""
     placed = settings.placed.values()
     taken_m = np.array([[*middle_m(thing), 0.0, radius_m(thing)] for thing in placed]).reshape(-1, 4)
@@ -183,10 +158,10 @@ def tiny_scene() -> Scene:
     sun = sun_direction(settings)
     inner = make_grid(np.zeros((9, 9), dtype=np.float32), INNER_CELLS * INNER_CELL_M / 8)
     stones = rocks.make_rocks(1, rng, partial(ground_z_m, inner))
-    broad = ground.pyramid(shadows(inner, stones, sun), inner.cell_m)
-    detail = ground.pyramid(ground.gravel(rng, sun, 128), ground.DETAIL_TEXEL_M)
-    stone = ground.pyramid(ground.stone(rng, 128), ground.STONE_TEXEL_M)
-    world = kernels().World(inner, inner, stones, detail, broad, stone, sun)
+    broad = pyramid(shadows(inner, stones, sun), inner.cell_m)
+    detail = pyramid(gravel(rng, sun, 128), DETAIL_TEXEL_M)
+    surface = pyramid(stone(rng, 128), STONE_TEXEL_M)
+    world = kernels.World(inner, inner, stones, detail, broad, surface, sun)
     return Scene(settings, world)
 
 
@@ -203,8 +178,8 @@ def inner_relief_m(settings: SceneSettings, rng: np.random.Generator) -> NDArray
     axis = np.asarray((np.arange(n + 1) - n / 2) * INNER_CELL_M, dtype=np.float64)
     rim = np.maximum(np.abs(axis)[:, None], np.abs(axis)[None, :])
     level_at_rim = 1.0 - smooth_step(rim, 28.0, 31.8)
-    swells = ground.fractal(n, rng, 1.9, 0.8 / INNER_CELL_M, 12.0 / INNER_CELL_M)
-    bumps = ground.fractal(n, rng, 1.7, 2.0, 0.8 / INNER_CELL_M)
+    swells = fractal(n, rng, 1.9, 0.8 / INNER_CELL_M, 12.0 / INNER_CELL_M)
+    bumps = fractal(n, rng, 1.7, 2.0, 0.8 / INNER_CELL_M)
     # a peak of three standard deviations comes to relief_m
     relief = settings.relief_m * (0.33 * swells + 0.035 * bumps)
     elevation = np.zeros((n + 1, n + 1), dtype=np.float64)
@@ -222,7 +197,7 @@ def outer_relief_m(settings: SceneSettings, rng: np.random.Generator) -> NDArray
     elevation = np.zeros((n + 1, n + 1), dtype=np.float64)
     if settings.relief_m == 0:
         return elevation.astype(np.float32)
-    hills = ground.fractal(n, rng, 1.6, 4.0, 120.0)
+    hills = fractal(n, rng, 1.6, 4.0, 120.0)
     axis = (np.arange(n + 1) - n / 2) * OUTER_CELL_M
     distance = np.hypot(axis[:, None], axis[None, :])
     elevation[:n, :n] = np.maximum(hills + 0.5, -0.5)
@@ -236,7 +211,7 @@ def smooth_step(values: Float64, low: float, high: float) -> Float64:
     return np.asarray(t * t * (3.0 - 2.0 * t))
 
 
-def make_grid(elevation_m: NDArray[np.float32], cell_m: float) -> Any:
+def make_grid(elevation_m: NDArray[np.float32], cell_m: float) -> kernels.Grid:
     """Return the ``kernels.Grid`` about the origin with the highest corner of every block of cells."""
     n = elevation_m.shape[0] - 1
     corners = (elevation_m[:-1, :-1], elevation_m[:-1, 1:], elevation_m[1:, :-1], elevation_m[1:, 1:])
@@ -249,7 +224,7 @@ def make_grid(elevation_m: NDArray[np.float32], cell_m: float) -> Any:
         peaks = peaks.reshape(m, 2, m, 2).max(axis=(1, 3))
         blocks.append(peaks.ravel())
     half = n * cell_m / 2
-    return kernels().Grid(
+    return kernels.Grid(
         np.ascontiguousarray(elevation_m),
         np.concatenate(blocks),
         np.array(start, dtype=np.int64),
@@ -263,7 +238,7 @@ def make_grid(elevation_m: NDArray[np.float32], cell_m: float) -> Any:
     )
 
 
-def ground_z_m(grid: Any, x_m: float, y_m: float) -> float:
+def ground_z_m(grid: kernels.Grid, x_m: float, y_m: float) -> float:
     """z of the triangle of ``grid`` under (x, y)."""
     px, py = (x_m - grid.x0_m) / grid.cell_m, (y_m - grid.y0_m) / grid.cell_m
     ix, iy = int(np.clip(px, 0, grid.cells - 1)), int(np.clip(py, 0, grid.cells - 1))
@@ -273,25 +248,23 @@ def ground_z_m(grid: Any, x_m: float, y_m: float) -> float:
     return float(-(h00 + rise))
 
 
-def ground_tones(grid: Any, sun: Float64, rng: np.random.Generator) -> NDArray[np.float32]:
+def ground_tones(grid: kernels.Grid, sun: Float64, rng: np.random.Generator) -> NDArray[np.float32]:
     """Relative brightness (n, n) [y, x] of the inner grid's cells: light and dark soil, lit by the sun."""
-    module = kernels()
     e = grid.elevation_m.astype(np.float64)
     sx = (e[:-1, 1:] - e[:-1, :-1] + e[1:, 1:] - e[1:, :-1]) / (2 * grid.cell_m)
     sy = (e[1:, :-1] - e[:-1, :-1] + e[1:, 1:] - e[:-1, 1:]) / (2 * grid.cell_m)
     cosine = np.maximum(-sx * sun[0] - sy * sun[1] - sun[2], 0.0) / np.sqrt(1.0 + sx * sx + sy * sy)
-    light = module.AMBIENT + (1.0 - module.AMBIENT) * cosine
-    level = module.AMBIENT - (1.0 - module.AMBIENT) * sun[2]
-    soil = ground.fractal(grid.cells, rng, 0.75, 2.0, 10.0 / grid.cell_m)
+    light = kernels.AMBIENT + (1.0 - kernels.AMBIENT) * cosine
+    level = kernels.AMBIENT - (1.0 - kernels.AMBIENT) * sun[2]
+    soil = fractal(grid.cells, rng, 0.75, 2.0, 10.0 / grid.cell_m)
     soil = np.exp(0.13 * soil)
     return np.asarray(soil * light / level, dtype=np.float32)
 
 
-def shadows(grid: Any, stones: Any, sun: Float64) -> NDArray[np.float32]:
+def shadows(grid: kernels.Grid, stones: kernels.Rocks, sun: Float64) -> NDArray[np.float32]:
     """What part (n, n) [y, x] of its light each ground texel keeps beside the rocks."""
-    module = kernels()
     kept = np.ones((grid.cells, grid.cells), dtype=np.float32)
-    in_shade = module.AMBIENT / (module.AMBIENT - (1.0 - module.AMBIENT) * sun[2])
+    in_shade = kernels.AMBIENT / (kernels.AMBIENT - (1.0 - kernels.AMBIENT) * sun[2])
     fine = (np.arange(SHADOW_SAMPLES) + 0.5) / SHADOW_SAMPLES
     for x, y, z, radius in stones.spheres_m:
         throw = (radius + max(-z + radius, 0.0)) / math.tan(math.asin(-sun[2]))
@@ -305,7 +278,7 @@ def shadows(grid: Any, stones: Any, sun: Float64) -> NDArray[np.float32]:
         points[..., 0], points[..., 1] = xs, ys[:, None]
         points[..., 2] = coarse_z_m(grid, low, high)
         clear = np.empty(points[..., 0].size, dtype=np.float32)
-        module.shadow_rays(stones, sun, points.reshape(-1, 3), clear)
+        kernels.shadow_rays(stones, sun, points.reshape(-1, 3), clear)
         q = SHADOW_SAMPLES
         clear = clear.reshape(high[1] - low[1], q, high[0] - low[0], q).mean(axis=(1, 3))
         block = kept[low[1] : high[1], low[0] : high[0]]
@@ -313,8 +286,124 @@ def shadows(grid: Any, stones: Any, sun: Float64) -> NDArray[np.float32]:
     return kept
 
 
-def coarse_z_m(grid: Any, low: NDArray[np.int64], high: NDArray[np.int64]) -> Float64:
+def coarse_z_m(grid: kernels.Grid, low: NDArray[np.int64], high: NDArray[np.int64]) -> Float64:
     """z at the shadow samples of a block of cells [low, high): each cell's mean height, repeated."""
     e = grid.elevation_m[low[1] : high[1] + 1, low[0] : high[0] + 1].astype(np.float64)
     middle = -0.25 * (e[:-1, :-1] + e[:-1, 1:] + e[1:, :-1] + e[1:, 1:])
     return np.repeat(np.repeat(middle, SHADOW_SAMPLES, axis=0), SHADOW_SAMPLES, axis=1)
+
+
+def fractal(
+    size: int, rng: np.random.Generator, falloff: float, shortest_px: float, longest_px: float
+) -> Float32:
+    """Return repeating noise (size, size) of mean 0 and variance 1.
+
+    Amplitude falls as frequency ** -falloff between the two wavelengths and is nil outside them.
+    """
+    spectrum = fft.rfft2(rng.standard_normal((size, size), dtype=np.float32))
+    fy = fft.fftfreq(size).astype(np.float32)[:, None]
+    fx = fft.rfftfreq(size).astype(np.float32)[None, :]
+    frequency = np.hypot(fx, fy)
+    inside = (frequency >= 1.0 / longest_px) & (frequency <= 1.0 / shortest_px)
+    frequency[~inside] = 1.0
+    spectrum *= np.where(inside, frequency ** np.float32(-falloff), np.float32(0.0))
+    noise = fft.irfft2(spectrum, s=(size, size))
+    return np.asarray(noise / noise.std(), dtype=np.float32)
+
+
+def gravel(rng: np.random.Generator, sun: NDArray[np.float64], size: int) -> Float32:
+    """Return a repeating picture of sand with pebbles, mean 1, lit from ``sun`` (unit, site frame)."""
+    tones = 1.0 + 0.11 * fractal(size, rng, 0.9, 2.5, 400.0)
+    rough = np.clip(fractal(size, rng, 1.2, 3.0, 40.0), -2.0, 2.0)
+    layers = []
+    for low, high, share in PEBBLES:
+        count = int(share * size * size / (np.pi * 0.75 * (0.5 * (low + high)) ** 2))
+        half_length = low * (high / low) ** rng.random(count)
+        pebble = np.empty((count, 6))
+        pebble[:, 0:2] = rng.random((count, 2)) * size
+        pebble[:, 2] = half_length
+        pebble[:, 3] = half_length * rng.uniform(0.55, 0.95, count)
+        pebble[:, 4] = rng.uniform(0.0, np.pi, count)
+        pebble[:, 5] = np.exp(rng.normal(0.0, 0.19, count))
+        layers.append(pebble)
+    kernels.lay_pebbles(tones, rough, np.concatenate(layers), sun[0], sun[1], -sun[2])
+    tones = np.minimum(tones, 1.9)
+    return np.asarray(tones / tones.mean(), dtype=np.float32)
+
+
+def stone(rng: np.random.Generator, size: int) -> Float32:
+    """Return a repeating picture of a rock's surface, mean 1: blotches, grain and pits."""
+    tones = 1.0 + 0.13 * fractal(size, rng, 1.2, 3.0, 500.0) + 0.09 * fractal(size, rng, 0.3, 2.5, 16.0)
+    pits = fractal(size, rng, 0.8, 6.0, 60.0)
+    tones *= 1.0 - 0.40 * np.clip(pits - 1.2, 0.0, 1.0)
+    return np.asarray(tones / tones.mean(), dtype=np.float32)
+
+
+def pyramid(tones: Float32, texel_m: float) -> kernels.Texture:
+    """Return the ``kernels.Texture`` of a square picture of relative brightness, side a power of two.
+
+    Each level is the 2 x 2 means of the one before, down to 4 texels across, so that edges stay aligned.
+    """
+    levels = [np.asarray(tones, dtype=np.float32)]
+    while levels[-1].shape[0] > 4:
+        n = levels[-1].shape[0] // 2
+        levels.append(levels[-1].reshape(n, 2, n, 2).mean(axis=(1, 3), dtype=np.float32))
+    padded = [np.pad(level, [(0, 1), (0, kernels.PAD)], mode="wrap") for level in levels]
+    texels = np.concatenate([level.ravel() for level in padded])
+    start = np.cumsum([0, *(level.size for level in padded[:-1])]).astype(np.int64)
+    stored = np.clip(np.rint(texels * kernels.ONE), 0, 65535).astype(np.uint16)
+    return kernels.Texture(stored, start, tones.shape[0], len(levels), texel_m)
+
+
+def kept_scene(settings: SceneSettings) -> Scene:
+    """Return what `build_scene` returns, from disk if it was built before by the same sources.
+
+    A scene that cannot be read, or is damaged, is built and written again; where nothing can be written, it
+    is built each time.
+    """
+    folder = folder_of(settings)
+    with contextlib.suppress(OSError, ValueError, TypeError):  # not there, or not whole
+        world = _read(folder, "world", kernels.World)
+        with contextlib.suppress(OSError):
+            os.utime(folder)  # used last
+        return Scene(settings, world)
+    found = build_scene(settings)
+    with contextlib.suppress(OSError):
+        _write(folder, found)
+        keep_newest(folder)
+    return found
+
+
+def folder_of(settings: SceneSettings) -> Path:
+    """Return where a scene is kept: under the digest of its settings and of all that makes it."""
+    makers = digest_of(Path(__file__).with_name(f"{name}.py") for name in MAKERS)
+    facts = (repr(settings), makers, np.__version__, scipy.__version__)
+    return kept_folder("scenes", hashlib.sha256("\n".join(facts).encode()).hexdigest())
+
+
+def parts(value: Any, name: str) -> list[tuple[str, Any]]:
+    """Return names and values of all arrays and numbers in tuples in tuples."""
+    if not hasattr(value, "_fields"):
+        return [(name, value)]
+    return [part for field in value._fields for part in parts(getattr(value, field), f"{name}.{field}")]
+
+
+def _write(folder: Path, made: Scene) -> None:
+    """Write a scene, whole or not at all: each array and number to a file of its own."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    scratch = Path(tempfile.mkdtemp(dir=folder.parent))
+    try:
+        for name, value in parts(made.world, "world"):
+            np.save(scratch / f"{name}.npy", value)
+        shutil.rmtree(folder, ignore_errors=True)  # what is there was not good
+        scratch.replace(folder)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _read(folder: Path, name: str, kind: Any) -> Any:
+    """A part of a scene that was written: arrays in private pages, copied where a process writes into one."""
+    if hasattr(kind, "_fields"):
+        return kind(*(_read(folder, f"{name}.{key}", of) for key, of in get_type_hints(kind).items()))
+    file = folder / f"{name}.npy"
+    return np.load(file).item() if kind in (int, float) else np.asarray(np.load(file, mmap_mode="c"))

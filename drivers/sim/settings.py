@@ -2,21 +2,192 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import ConfigDict, Field, model_validator
 
-from calib.files.records import ABSENT, PathInFile
+from calib.files.records import ABSENT, PathInFile, problem
+from calib.geometry.cahvor import CameraModel
 from calib.geometry.mode import FLIPS, FlipName, Mode
+from calib.geometry.rigid import Rigid, rot_y, rot_z
 from drivers.errors import BadOptions
 from drivers.faults import read_script
 from drivers.options import DriverOptions, ReadBy, read_options, wholes
-from drivers.sim.camera_settings import CameraSettings, ClockSettings, TemperatureSettings
 from drivers.sim.heads import DEFAULT_HEADS, HeadModel, check_head, head_settings
-from drivers.sim.scene import SceneSettings
+from drivers.sim.placed import SceneSettings
 from drivers.simulation_clock import simulation_speed
+
+STEP_K = 1 / 16
+"""Temperatures are taken in such steps, since every other camera model costs the renderer a table of rays: at
+the default coefficients a step moves a picture's corner by 0.006 px."""
+
+
+class LensSettings(DriverOptions):
+    """The ``lens`` of every camera of a simulation."""
+
+    falloff: Annotated[float, Field(ge=0.0, le=8.0)] = 0.0
+    """Power of the cosine of a ray's angle to the axis by which it is dimmed: 4 by geometry, 0 for none."""
+    f_number: Annotated[float, Field(ge=0.0, le=1e3)] = 0.0
+    """Focal length over aperture; 0: a pinhole."""
+    focus_m: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
+    """Distance of what is sharp, along the axis; 0: infinitely far."""
+    pitch_um: Annotated[float, Field(ge=0.5, le=50.0)] = 12.0
+    """From pixel to pixel; with a model's focal length in pixels it makes that in metres."""
+    dust: Annotated[int, Field(ge=0, le=500)] = 0
+    """Specks on the window."""
+    dust_um: Annotated[float, Field(ge=1.0, le=1000.0)] = 60.0
+    """Their diameter."""
+    dust_gap_um: Annotated[float, Field(ge=0.0, le=10_000.0)] = 1000.0
+    """From the window to the pixels."""
+
+
+class ExposureSettings(DriverOptions):
+    """The ``exposure`` of every camera of a simulation."""
+
+    reference_s: Annotated[float, Field(ge=0.0, le=1e3)] = 0.0
+    """The exposure time that gives the scene its own brightness, at gain 1; grey levels grow with time and
+    gain. 0: they do not."""
+    gain: Annotated[float, Field(ge=1.0, le=64.0)] = 1.0
+    """At the start."""
+    auto: bool = False
+    """Whether the camera sets time and gain itself, from ``exposure_s`` on."""
+    target_dn: Annotated[float, Field(ge=10.0, le=245.0)] = 110.0
+    """The grey level that it aims at."""
+    share: Annotated[float, Field(ge=0.01, le=1.0)] = 0.5
+    """Of the way there, in its logarithm, that a frame's decision goes."""
+    lag_frames: Annotated[int, Field(ge=1, le=8)] = 2
+    """From the frame that is metered to the first one with what was decided."""
+    shortest_s: Annotated[float, Field(ge=1e-6, le=10.0)] = 0.0001
+    """The shortest time."""
+    longest_s: Annotated[float, Field(ge=0.0, le=1e3)] = 0.03
+    """The longest time; gain rises where it is too short."""
+    most_gain: Annotated[float, Field(ge=1.0, le=64.0)] = 8.0
+    """The highest gain."""
+
+
+class CameraSettings(DriverOptions):
+    """How a simulated camera takes pictures."""
+
+    rate_hz: Annotated[float, Field(gt=0.0, le=1e4)] = 10.0
+    """Frames a second."""
+    exposure_s: Annotated[float, Field(gt=0.0, le=1e3)] = 0.008
+    """Exposure time."""
+    readout_s: Annotated[float, Field(ge=0.0, le=1e3)] = 0.02
+    """From the end of an exposure until the frame can be had."""
+    read_noise_dn: Annotated[float, Field(ge=0.0, le=255.0)] = 1.0
+    """Standard deviation of the noise in the dark, grey levels of 0..255."""
+    shot_noise_dn: Annotated[float, Field(ge=0.0, le=255.0)] = 1.7
+    """Standard deviation that light adds at mid grey (128); grows as the root of the grey level."""
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 1
+    """Of the noise; with the camera's name and the sequence number it fixes every pixel."""
+    smear: bool = False
+    """Whether what moves during an exposure is drawn as often as it takes for views less than a pixel
+    apart."""
+    row_time_s: Annotated[float, Field(ge=0.0, le=0.001)] = 0.0
+    """Rolling shutter: from the exposure of one row to that of the next; 0: all rows at once."""
+    colour: bool = False
+    """Whether pixels lie under red, green and blue filters, and pictures are (h, w, 3) BGR."""
+    jpeg_quality: Annotated[int, Field(ge=0, le=100)] = 0
+    """Of the frames as they come, 1 to 100; 0: they come as they are."""
+    lens: LensSettings = LensSettings()
+    """Falloff, blur and dust."""
+    exposure: ExposureSettings = ExposureSettings()
+    """How grey levels follow time and gain."""
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        exposure, lens = self.exposure, self.lens
+        if exposure.auto and not exposure.reference_s:
+            raise problem("exposure.auto", "it needs exposure.reference_s above 0: grey levels follow it")
+        if exposure.auto and exposure.shortest_s > exposure.longest_s:
+            message = f"{exposure.shortest_s:g} is above longest_s {exposure.longest_s:g}"
+            raise problem("exposure.shortest_s", message)
+        if lens.f_number and 0 < lens.focus_m < 0.1:
+            raise problem(
+                "lens.focus_m", f"{lens.focus_m:g} where 0 (infinitely far) or 0.1 or more is expected"
+            )
+        if message := self.misfit(rows=1):
+            raise problem("", message)
+        return self
+
+    def misfit(self, rows: int) -> str:
+        """Return why a picture of so many rows does not fit the rate; empty if it does."""
+        longest_s = max(self.exposure_s, self.exposure.longest_s if self.exposure.auto else 0.0)
+        all_rows_s = longest_s + (rows - 1) * self.row_time_s
+        if all_rows_s < 1 / self.rate_hz:
+            return ""
+        what = f"exposure_s {self.exposure_s:g}"
+        if all_rows_s != self.exposure_s:
+            what = f"{all_rows_s:g} s for all rows of a picture"
+        return f"{what} does not fit rate_hz {self.rate_hz:g}"
+
+
+class ClockSettings(DriverOptions):
+    """When one camera exposes, and what its stamps are worth."""
+
+    offset_s: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """How much later than the others' its first frame is exposed."""
+    drift_ppm: Annotated[float, Field(ge=-500.0, le=500.0)] = 0.0
+    """How much faster its clock is."""
+    own_stamps: bool = True
+    """Whether that clock stamps its frames too; else the host's does, as the kernel's for V4L2 cameras."""
+    stamped_late_s: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
+    """How much later than the exposure its stamps are; the negative of it is what the camera's ``offset_s``
+    in a configuration should be."""
+
+
+class TemperatureSettings(DriverOptions):
+    """What a day's temperature does to the cameras; with amplitude 0 nothing changes."""
+
+    amplitude_k: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
+    """Of the temperature about its mean."""
+    period_s: Annotated[float, Field(ge=1.0, le=1e6)] = 86400.0
+    """A day."""
+    phase_rad: Annotated[float, Field(ge=-6.2832, le=6.2832)] = 0.0
+    """Of the sine at the start; 0: the mean, getting warmer."""
+    focal_ppm_per_k: Annotated[float, Field(ge=-1000.0, le=1000.0)] = -31.0
+    """How much longer the focal lengths get."""
+    centre_x_px_per_k: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.05
+    """How far the images' centres move to the right; in right cameras, which are mounted as in a mirror, to
+    the left."""
+    centre_y_px_per_k: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.05
+    """How far they move down."""
+    mount_tilt_rad_per_k: Annotated[float, Field(ge=-0.001, le=0.001)] = 2e-5
+    """How far the head leans up, behind its joints."""
+    mount_pan_rad_per_k: Annotated[float, Field(ge=-0.001, le=0.001)] = 1e-5
+    """How far it turns right."""
+
+    def change_k(self, passed_s: float) -> float:
+        """Return by how much it is warmer than the mean, kelvin, in whole steps."""
+        warmer = self.amplitude_k * math.sin(math.tau * passed_s / self.period_s + self.phase_rad)
+        return STEP_K * round(warmer / STEP_K)
+
+    def camera(self, model: CameraModel, is_right: bool, change_k: float) -> CameraModel:
+        """Return a camera as it is at a temperature; itself at the mean.
+
+        The vectors' parts along A are the image centre, those across it the focal lengths (Yakimovsky and
+        Cunningham, 1978).
+        """
+        if change_k == 0:
+            return model
+        longer = 1 + 1e-6 * self.focal_ppm_per_k * change_k
+        moved = {}
+        x_px = self.centre_x_px_per_k * change_k * (-1 if is_right else 1)
+        for letter, by_px in (("H", x_px), ("V", self.centre_y_px_per_k * change_k)):
+            vector = getattr(model, letter)
+            centre_px = float(np.dot(model.A, vector))
+            moved[letter] = longer * (vector - centre_px * model.A) + (centre_px + by_px) * model.A
+        return replace(model, **moved)
+
+    def mount(self, change_k: float) -> Rigid:
+        """Return how the head, behind its joints, has turned at a temperature."""
+        turned = rot_z(self.mount_pan_rad_per_k * change_k) @ rot_y(self.mount_tilt_rad_per_k * change_k)
+        return Rigid(turned, np.zeros(3))
 
 
 def scene_settings(section: Any) -> SceneSettings:

@@ -13,8 +13,8 @@ import pytest
 from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.rig import Rig, RigCamera
 from drivers.sim import rover
-from drivers.sim.kept_scenes import kept_scene
-from drivers.sim.scene import Scene, SceneSettings
+from drivers.sim.placed import SceneSettings
+from drivers.sim.scene import Scene, kept_scene
 
 SHRINK = 4
 

@@ -6,10 +6,10 @@ import numpy as np
 
 from drivers.clock import ManualClock
 from drivers.faults import FaultPanel
-from drivers.sim.camera_settings import CameraSettings
 from drivers.sim.cameras import SimulatedCamera
 from drivers.sim.heads import PRESETS
 from drivers.sim.pan_tilt import SimulatedPanTilt
+from drivers.sim.settings import CameraSettings
 
 START = 100.0
 SIZE = (64, 48)

@@ -12,8 +12,8 @@ import pytest
 from drivers.clock import SystemClock
 from drivers.errors import DriverError, NoFreshFrame
 from drivers.faults import CAMERA_WORDS, FaultPanel
-from drivers.sim.camera_settings import CameraSettings
 from drivers.sim.cameras import SimulatedCamera
+from drivers.sim.settings import CameraSettings
 from drivers.simulation_clock import SimulationClock
 from hil_tests.drivers.fault_bench import PATIENCE_S, SIZE, START, Bench
 

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from drivers.errors import BadOptions
-from drivers.sim.rover import RoverModel
 from drivers.simulation_clock import MAX
 from mastctl.config import Config, Listen, load_config, not_simulated
 from mastctl.devices.frames import camera_and_sequence
@@ -30,6 +29,7 @@ from mastctl.experiment.pointing import (
 )
 
 if TYPE_CHECKING:
+    from drivers.sim.rover import RoverModel
     from mastctl.client import Client
     from mastctl.daemon import RunningDaemon
 

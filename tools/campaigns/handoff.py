@@ -34,11 +34,20 @@ from calib.matching.handoff import RefinedPixel, RefineSettings, refine_handoff
 from calib.matching.partner import find_partner
 from calib.matching.verdict import MatchSettings
 from calib.matching.warp import Plane, PosedImage, warp_patch
-from drivers.sim import ground
-from drivers.sim.compiled import kernels
+from drivers.sim import kernels
+from drivers.sim.placed import SceneSettings
 from drivers.sim.render import compile_renderer
 from drivers.sim.rocks import make_brick, meshes, together
-from drivers.sim.scene import Scene, SceneSettings, build_scene, sun_direction
+from drivers.sim.scene import (
+    DETAIL_TEXEL_M,
+    DETAIL_TEXELS,
+    Scene,
+    build_scene,
+    fractal,
+    gravel,
+    pyramid,
+    sun_direction,
+)
 from mastctl.cli.options import at_least
 from mastctl.cli.tasks import results_of
 from mastctl.experiment.targets import BORDER_PX, texture_mask
@@ -336,7 +345,7 @@ def faded(scene: Scene, contrast: float, broad: bool = True) -> Scene:
     world = scene.world
 
     def less(picture: Any) -> Any:
-        one = kernels().ONE
+        one = kernels.ONE
         texels = np.rint(one + contrast * (picture.texels.astype(np.float32) - one))
         return picture._replace(texels=texels.astype(np.uint16))
 
@@ -346,11 +355,11 @@ def faded(scene: Scene, contrast: float, broad: bool = True) -> Scene:
 
 def repeated(scene: Scene, count: int, natural: float, rng: np.random.Generator) -> Scene:
     """Return the scene with ground that repeats ``count`` times a texture's side, and some natural gravel."""
-    side = ground.DETAIL_TEXELS
-    tile = 1.0 + 0.25 * ground.fractal(side // count, rng, 0.8, 3.0, side / count)
-    gravel = ground.gravel(rng, sun_direction(scene.settings), side) if natural else np.ones((side, side))
-    tones = np.clip(np.tile(tile, (count, count)) * (1.0 + natural * (gravel - 1.0)), 0.1, 1.9)
-    detail = ground.pyramid(tones.astype(np.float32), ground.DETAIL_TEXEL_M)
+    side = DETAIL_TEXELS
+    tile = 1.0 + 0.25 * fractal(side // count, rng, 0.8, 3.0, side / count)
+    pebbles = gravel(rng, sun_direction(scene.settings), side) if natural else np.ones((side, side))
+    tones = np.clip(np.tile(tile, (count, count)) * (1.0 + natural * (pebbles - 1.0)), 0.1, 1.9)
+    detail = pyramid(tones.astype(np.float32), DETAIL_TEXEL_M)
     plain = faded(scene, 0.1)
     return Scene(scene.settings, plain.world._replace(detail=detail))
 

@@ -26,7 +26,8 @@ from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import target_approach_budget
 from calib.matching.look import seen_by
 from calib.matching.track import Track, moved_track, start_track
-from drivers.sim.scene import SceneSettings, build_scene
+from drivers.sim.placed import SceneSettings
+from drivers.sim.scene import build_scene
 from mastctl.cli.tasks import results_of
 from mastctl.experiment.targets import texture_mask
 from mastctl.motion.search import choose_pairs

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.sim import ground
-from drivers.sim.scene import Scene, SceneSettings, build_scene
+from drivers.sim import scene
+from drivers.sim.placed import SceneSettings
+from drivers.sim.scene import Scene, build_scene
 
 TEXELS = 128
 
@@ -13,6 +14,6 @@ TEXELS = 128
 def build_small_scene(settings: SceneSettings) -> Scene:
     """As `build_scene`, but gravel and stone are 128 texels across, not 4,096 and 1,024: most of the time."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ground, "DETAIL_TEXELS", TEXELS)
-        patch.setattr(ground, "STONE_TEXELS", TEXELS)
+        patch.setattr(scene, "DETAIL_TEXELS", TEXELS)
+        patch.setattr(scene, "STONE_TEXELS", TEXELS)
         return build_scene(settings)

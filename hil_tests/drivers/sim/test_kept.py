@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.sim import kept, kept_scenes
+from drivers.sim import kept, scene
 from drivers.sim.kept import keep_newest, kept_folder
-from drivers.sim.kept_scenes import FACTS, folder_of, kept_scene
-from drivers.sim.scene import Scene, SceneSettings
+from drivers.sim.placed import SceneSettings
+from drivers.sim.scene import Scene, folder_of, kept_scene
 from drivers.sim.settings import scene_settings
 from hil_tests.drivers.sim.small_scenes import build_small_scene
 
@@ -33,12 +33,12 @@ def home(tmp_path: Path, built: Scene, monkeypatch: pytest.MonkeyPatch) -> list[
         asked.append(settings)
         return built
 
-    monkeypatch.setattr(kept_scenes, "build_scene", build)
+    monkeypatch.setattr(scene, "build_scene", build)
     return asked
 
 
 def same(one: Scene, other: Scene) -> bool:
-    pairs = zip(kept_scenes.parts(one.world, ""), kept_scenes.parts(other.world, ""), strict=True)
+    pairs = zip(scene.parts(one.world, ""), scene.parts(other.world, ""), strict=True)
     return all(a[0] == b[0] and np.array_equal(a[1], b[1]) for a, b in pairs)
 
 
@@ -59,7 +59,7 @@ def test_a_damaged_scene_is_built_again(home: list[SceneSettings], built: Scene,
     if harm == "cut short":
         victim.write_bytes(victim.read_bytes()[:5000])
     else:
-        (folder / FACTS).write_text("{}")
+        (folder / "world.inner.cells.npy").write_text("{}")
     assert kept_scene(SETTINGS) is built
     assert len(home) == 2
     assert same(kept_scene(SETTINGS), built) and len(home) == 2

@@ -11,9 +11,10 @@ import pytest
 
 from calib.files.mast_file import load_rig
 from calib.geometry.rigid import Rigid
-from drivers.sim.optics.lens import LensSettings, SimulatedLens
+from drivers.sim.optics import SimulatedLens
 from drivers.sim.render import Renderer
 from drivers.sim.scene import Scene
+from drivers.sim.settings import LensSettings
 
 EYE = "pancam_left"
 

@@ -8,9 +8,8 @@ import pytest
 from drivers.clock import ManualClock
 from drivers.errors import BadFrame
 from drivers.faults import FaultPanel
-from drivers.sim.camera_settings import CameraSettings
 from drivers.sim.cameras import SimulatedCamera
-from drivers.sim.optics.exposure import ExposureSettings
+from drivers.sim.settings import CameraSettings, ExposureSettings
 from mastctl.devices.frames import checked
 
 SIZE = (64, 48)

@@ -9,9 +9,9 @@ import pytest
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
-from drivers.sim.kept_scenes import kept_scene
+from drivers.sim.placed import SceneSettings
 from drivers.sim.render import Renderer, Stills, ray_table
-from drivers.sim.scene import Scene, SceneSettings
+from drivers.sim.scene import Scene, kept_scene
 from hil_tests.support import rendered_patches as bias
 
 MOST_BIAS_PX = 0.01

@@ -8,8 +8,8 @@ import pytest
 from drivers.clock import ManualClock
 from drivers.faults import FaultPanel
 from drivers.interfaces import Camera
-from drivers.sim.camera_settings import CameraSettings
 from drivers.sim.cameras import RING_FRAMES, SimulatedCamera
+from drivers.sim.settings import CameraSettings
 
 SIZE = (64, 48)
 SETTINGS = CameraSettings(rate_hz=10.0, exposure_s=0.01, readout_s=0.02, seed=3)

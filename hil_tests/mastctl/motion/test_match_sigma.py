@@ -15,8 +15,9 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.matching.warp import grey
+from drivers.sim.placed import SceneSettings
 from drivers.sim.render import Renderer
-from drivers.sim.scene import Scene, SceneSettings, build_scene
+from drivers.sim.scene import Scene, build_scene
 from hil_tests.support.sim_survey.board import photograph
 from mastctl.devices.frames import StampedFrame
 from mastctl.experiment.targets import texture_mask

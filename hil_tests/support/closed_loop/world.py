@@ -19,11 +19,12 @@ from calib.geometry.rigid import FloatArray
 from drivers.clock import SystemClock
 from drivers.faults import FaultPanel
 from drivers.sim.axis import WireAxis
-from drivers.sim.camera_settings import CameraSettings
 from drivers.sim.cameras import SimulatedCamera
 from drivers.sim.heads import PRESETS
+from drivers.sim.placed import SceneSettings
 from drivers.sim.render import Renderer, compile_renderer
-from drivers.sim.scene import SceneSettings, build_scene
+from drivers.sim.scene import build_scene
+from drivers.sim.settings import CameraSettings
 from drivers.sim.wire.dynamixel_bus import DynamixelBus
 from drivers.sim.wire.dynamixel_models import BAUD_RATES
 from drivers.sim.wire.dynamixel_servo import SimulatedServo
