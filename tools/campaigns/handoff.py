@@ -35,19 +35,11 @@ from calib.matching.partner import find_partner
 from calib.matching.verdict import MatchSettings
 from calib.matching.warp import Plane, PosedImage, warp_patch
 from drivers.sim import kernels
+from drivers.sim import scene as site
 from drivers.sim.placed import SceneSettings
 from drivers.sim.render import compile_renderer
 from drivers.sim.rocks import make_brick, meshes, together
-from drivers.sim.scene import (
-    DETAIL_TEXEL_M,
-    DETAIL_TEXELS,
-    Scene,
-    build_scene,
-    fractal,
-    gravel,
-    pyramid,
-    sun_direction,
-)
+from drivers.sim.scene import Scene, build_scene, sun_direction
 from mastctl.cli.options import at_least
 from mastctl.cli.tasks import results_of
 from mastctl.experiment.targets import BORDER_PX, texture_mask
@@ -355,11 +347,11 @@ def faded(scene: Scene, contrast: float, broad: bool = True) -> Scene:
 
 def repeated(scene: Scene, count: int, natural: float, rng: np.random.Generator) -> Scene:
     """Return the scene with ground that repeats ``count`` times a texture's side, and some natural gravel."""
-    side = DETAIL_TEXELS
-    tile = 1.0 + 0.25 * fractal(side // count, rng, 0.8, 3.0, side / count)
-    pebbles = gravel(rng, sun_direction(scene.settings), side) if natural else np.ones((side, side))
+    side = site.DETAIL_TEXELS
+    tile = 1.0 + 0.25 * site.fractal(side // count, rng, 0.8, 3.0, side / count)
+    pebbles = site.gravel(rng, sun_direction(scene.settings), side) if natural else np.ones((side, side))
     tones = np.clip(np.tile(tile, (count, count)) * (1.0 + natural * (pebbles - 1.0)), 0.1, 1.9)
-    detail = pyramid(tones.astype(np.float32), DETAIL_TEXEL_M)
+    detail = site.pyramid(tones.astype(np.float32), site.DETAIL_TEXEL_M)
     plain = faded(scene, 0.1)
     return Scene(scene.settings, plain.world._replace(detail=detail))
 
