@@ -19,7 +19,7 @@ from drivers import faults
 from drivers.errors import DriverError
 from mastctl.cli.main import build_parser
 from mastctl.conform.rig_checks import RIG
-from mastctl.control.standing import MEANINGS
+from mastctl.control.machine import MEANINGS
 from mastctl.errors import MastctlError
 from mastctl.testing.drivers import test_camera, test_head
 from mastctl.web.app import api

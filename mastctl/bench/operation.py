@@ -36,8 +36,7 @@ from mastctl.bench.runs import (
     new_record,
     save_board,
 )
-from mastctl.control.caller import Caller
-from mastctl.control.lease import Lease, LeaseTable, StopCame
+from mastctl.control.lease import Caller, Lease, LeaseTable, StopCame
 from mastctl.control.publisher import Publisher, ThreadSubscription
 from mastctl.errors import BadRequest, MastctlError, NotNow, Unable
 

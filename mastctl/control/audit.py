@@ -19,7 +19,7 @@ from typing import Any
 
 from drivers.clock import Clock, SystemClock
 from mastctl.as_json import writable
-from mastctl.control.standing import StandingFault
+from mastctl.control.machine import StandingFault
 from mastctl.errors import one_line
 from mastctl.json_lines import append_line
 

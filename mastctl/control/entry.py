@@ -1,7 +1,10 @@
-"""The one entry: each command passes here, and is recorded with its client, lease, request and result.
+"""The one entry: each command passes it, and is recorded with its client, lease, request and result.
 
 The order of the checks: role, idempotency key, deadline, lease, state; then the act, then the record. A stop
 goes the other way round (`CommandEntry.first`): it acts, and everything else follows.
+
+A command that is sent twice with one key acts once. Answers are kept, and failures of a device or of the
+program, which may have acted. A refusal changed nothing and is forgotten, so the same key may be sent again.
 """
 
 from __future__ import annotations
@@ -11,23 +14,27 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
-from drivers.clock import Clock
+from drivers.clock import Clock, SystemClock
 from mastctl.answers import Role
 from mastctl.as_json import writable
 from mastctl.control.audit import AuditLog
-from mastctl.control.caller import ANONYMOUS, NETWORK, Caller
-from mastctl.control.idempotency import Answer, Answers
-from mastctl.control.lease import LeaseTable, StopCame
+from mastctl.control.lease import ANONYMOUS, NETWORK, Caller, LeaseTable, StopCame
 from mastctl.control.machine import Need
 from mastctl.control.publisher import Publisher
 from mastctl.errors import BadRequest, MastctlError, NotNow, Stopped, error_body
 
+Answer = TypeVar("Answer", bound=Mapping[str, Any])
+
 LONGEST_DEADLINE_S = 3600.0
+KEPT_S = 600.0
+KEPT = 4096  # keys; for more, the oldest is forgotten before its time
+LONGEST_KEY = 200
+WAIT_S = 30.0  # for the first of two, longer than any command takes that is accepted or refused
 FOLLOWED = 256  # operations whose end is still recorded with the client that began them
 PUBLISHED = 256  # records that a new listener still gets
 PUBLISHED_OF_STRANGERS = 32  # beside them
@@ -35,24 +42,11 @@ PUBLISHED_OF_STRANGERS = 32  # beside them
 
 @dataclass(frozen=True)
 class Command:
-    """A kind of command.
+    """A kind of command: its name in the record, the role that its caller needs, its need of the state.
 
-    Attributes
-    ----------
-    name
-        Its name in the record.
-    role
-        The rights that its caller needs.
-    steers
-        Whether it is refused while another client steers.
-    need
-        What it needs of the daemon's state; None for nothing.
-    goes_on
-        Whether it is sent again and again to keep its operation going: then only the first is recorded, and
-        what is refused.
-    grants
-        Whether its answer has a lease's id, which proves the lease: never by a key of an anonymous client,
-        and never of a lease that has ended.
+    ``steers``: it is refused while another client steers. ``goes_on``: it is sent again and again to keep its
+    operation going; only the first is recorded, and what is refused. ``grants``: its answer has a lease's id,
+    which proves the lease: never by a key of an anonymous client, and never of a lease that has ended.
     """
 
     name: str
@@ -102,21 +96,11 @@ SIMULATION_FAULTS_OFF = Command("simulation.faults_off")
 
 @dataclass(frozen=True)
 class CommandRequest:
-    """One request for a command.
+    """One request for a command, which came at ``came_s`` of the daemon's clock with a lease's id and a key.
 
-    Attributes
-    ----------
-    came_s
-        When it came, by the daemon's clock; needed for a deadline only.
-    request
-        The request itself, as JSON.
-    lease, key
-        The lease's id and the idempotency key that came with it.
-    deadline_s
-        How long it is given from ``came_s`` on, seconds of the daemon's clock; None for the usual time.
-    last_stop
-        `mastctl.control.lease.LeaseTable.last_stop` when it came: what steers is not carried out after a
-        later one. None: that is not known.
+    ``deadline_s``: how long it is given from ``came_s`` on, seconds; None for the usual time. ``last_stop``:
+    `mastctl.control.lease.LeaseTable.last_stop` when it came: what steers is not carried out after a later
+    one; None if that is not known.
     """
 
     caller: Caller
@@ -136,8 +120,88 @@ class CommandRequest:
             raise BadRequest("bad_request", f"deadline_s: {deadline_s:g} where {expected}")
 
 
+@dataclass(eq=False)
+class _Kept:
+    """The request that came with a key, and its answer or its error."""
+
+    request: Mapping[str, Any]
+    since_s: float
+    answer: Any = None
+    error: BaseException | None = None
+
+    @property
+    def done(self) -> bool:
+        return self.answer is not None or self.error is not None
+
+
+class Answers:
+    """The answers by their keys, forgotten by ``clock``; safe to use from any thread.
+
+    The second of two waits on ``waits_on``, the service's clock, while the first is at work.
+    """
+
+    def __init__(self, clock: Clock, waits_on: Clock | None = None) -> None:
+        self._clock = clock
+        self._changed = (waits_on or SystemClock()).signal()
+        self._kept: dict[tuple[str, str], _Kept] = {}  # oldest first
+
+    def once(
+        self, client: str, key: str, request: Mapping[str, Any], act: Callable[[], Answer]
+    ) -> tuple[Answer, bool]:
+        """Return what ``act()`` returns, or returned before, and whether it was before.
+
+        A key is 1 to 200 signs of printable ASCII; another client's is another key, and ``request`` the same
+        whenever the key is. Raises BadRequest ``key_reused`` if it came with another request, ``bad_request``
+        for what is no key; NotNow ``key_in_use`` if the first is still at work after 30 s.
+        """
+        if not (0 < len(key) <= LONGEST_KEY and key.isascii() and key.isprintable()):
+            expected = f"1 to {LONGEST_KEY} printable ASCII characters are expected"
+            raise BadRequest("bad_request", f"Idempotency-Key is '{key[:40]}' where {expected}")
+        place = client, key
+        with self._changed:
+            now_s = self._clock.now_s()
+            for old, one in list(self._kept.items()):
+                if not one.done:
+                    continue
+                if now_s - one.since_s < KEPT_S and len(self._kept) < KEPT:
+                    break
+                del self._kept[old]
+            known = self._kept.get(place)
+            if known is not None:
+                return self._answer_of(known, key, request), True
+            mine = self._kept[place] = _Kept(request, now_s)
+        try:
+            answer = act()
+            mine.answer = answer
+        except BaseException as error:
+            mine.error = error
+            raise
+        finally:
+            with self._changed:
+                if isinstance(mine.error, MastctlError):
+                    del self._kept[place]
+                self._changed.notify_all()
+        return answer, False
+
+    def _answer_of(self, known: _Kept, key: str, request: Mapping[str, Any]) -> Any:
+        """Return the answer that the first got, or gets; the lock is kept."""
+        if known.request != request:
+            message = f"Idempotency-Key '{key[:40]}' came before with another request; take a new one"
+            raise BadRequest("key_reused", message)
+        until_s = self._clock.now_s() + WAIT_S
+        while not known.done:
+            left_s = until_s - self._clock.now_s()
+            if left_s <= 0:
+                message = f"the request that came first with Idempotency-Key '{key[:40]}' is still at work"
+                raise NotNow("key_in_use", message)
+            self._changed.wait(left_s, idle=True)
+        if known.error is not None:
+            raise known.error
+        return known.answer
+
+
 class JudgesAndEnds(Protocol):
-    """What of `mastctl.control.operations.OperationRunner` refuses a command, and ends an operation."""
+    """The part of `mastctl.control.operations.OperationRunner` that the entry needs."""
 
     def refusal(self, need: Need) -> MastctlError | None: ...
     def end_within(self, name: str, left_s: float, allowed_s: float) -> None: ...
@@ -147,16 +211,8 @@ class JudgesAndEnds(Protocol):
 class CommandEntry:
     """The entry of one daemon; safe to use from any thread.
 
-    Parameters
-    ----------
-    clock
-        The clock of deadlines and records: the daemon's.
-    operations
-        Refuses what does not fit the state, and ends operations at their deadline.
-    publisher
-        Gets each record, and keeps the newest 256; one of its own by default.
-    strangers
-        The log for strangers, who may be many: they push no other record out of ``audit``.
+    ``publisher`` gets each record, and keeps the newest. ``strangers`` is the log for strangers, who may be
+    many: they push no other record out of ``audit``.
     """
 
     def __init__(
@@ -166,16 +222,16 @@ class CommandEntry:
         answers: Answers,
         audit: AuditLog,
         operations: JudgesAndEnds,
-        publisher: Publisher | None = None,
-        strangers: AuditLog | None = None,
+        publisher: Publisher,
+        strangers: AuditLog,
     ) -> None:
         self.leases = leases
         self.audit = audit
-        self.strangers = strangers or audit
+        self.strangers = strangers
         self._clock = clock
         self._answers = answers
         self._operations = operations
-        self._publisher = publisher or Publisher()
+        self._publisher = publisher
         # Keys, oldest first: of known clients, and of strangers.
         self._published: tuple[deque[str], deque[str]] = deque(), deque()
         self._numbers = itertools.count(1)
@@ -209,11 +265,11 @@ class CommandEntry:
                     sent.caller.name, sent.key, same, lambda: self._act(command, sent, act, usual_s)
                 )
                 if again and command.grants:
-                    self._check_holds(answer["lease_id"])
+                    self.leases.check(answer["lease_id"], ", with another Idempotency-Key")
         except BaseException as error:
-            self._record(command, sent, None, error, again)
+            self.record(command, sent, None, error, again)
             raise
-        self._record(command, sent, answer, None, again)
+        self.record(command, sent, answer, None, again)
         return answer
 
     def first(
@@ -232,17 +288,7 @@ class CommandEntry:
             raise
         finally:
             if recorded:
-                self.note(command, sent, answer, error)
-
-    def note(
-        self,
-        command: Command,
-        sent: CommandRequest,
-        answer: Mapping[str, Any] | None,
-        error: BaseException | None,
-    ) -> None:
-        """Record a stop that could not even be tried, or one whose reason came after it."""
-        self._record(command, sent, answer, error, begins=False)
+                self.record(command, sent, answer, error, begins=False)
 
     def refused(self, caller: Caller, command: str, code: str, message: str) -> None:
         """Record a request that was refused before it was a command. It is not published."""
@@ -261,17 +307,14 @@ class CommandEntry:
         self, command: Command, sent: CommandRequest, act: Callable[[], Answer], usual_s: float | None
     ) -> Answer:
         """Carry it out if no check fails; its operation gets its deadline."""
-        if sent.deadline_s is not None and self._left_s(sent, sent.deadline_s) <= 0.0:
+        if sent.deadline_s is not None and sent.came_s + sent.deadline_s <= self._clock.now_s():
             message = f"the {sent.deadline_s:g} s for {command.name} were over before it could begin"
             raise NotNow("deadline_passed", message)
         if self._stopped_since(command, sent):
             raise Stopped(
                 f"{command.name} was requested before a stop, and is not carried out; send it again"
             )
-        steering: AbstractContextManager[None] = nullcontext()
-        if command.steers:
-            steering = self.leases.steering(sent.caller, sent.lease)
-        with steering:
+        with self.leases.steering(sent.caller, sent.lease) if command.steers else nullcontext():
             refusal = None if command.need is None else self._operations.refusal(command.need)
             if refusal is not None:
                 raise refusal
@@ -281,24 +324,15 @@ class CommandEntry:
                 self._operations.end_stopped(operation)
             allowed_s = usual_s if sent.deadline_s is None else sent.deadline_s
             if operation is not None and allowed_s is not None and operation not in self._began:
-                self._operations.end_within(operation, self._left_s(sent, allowed_s), allowed_s)
+                left_s = sent.came_s + allowed_s - self._clock.now_s()
+                self._operations.end_within(operation, left_s, allowed_s)
             return answer
-
-    def _check_holds(self, lease_id: str) -> None:
-        """Pass a lease that was granted before and still holds. Raises NotNow."""
-        try:
-            self.leases.check(lease_id)
-        except NotNow as over:
-            raise NotNow(over.code, f"{over}, with another Idempotency-Key") from None
 
     def _stopped_since(self, command: Command, sent: CommandRequest) -> bool:
         """Whether a stop came after the request of a command that steers."""
         return command.steers and sent.last_stop not in (None, self.leases.last_stop)
 
-    def _left_s(self, sent: CommandRequest, allowed_s: float) -> float:
-        return sent.came_s + allowed_s - self._clock.now_s()
-
-    def _record(
+    def record(
         self,
         command: Command,
         sent: CommandRequest,
@@ -307,7 +341,7 @@ class CommandEntry:
         again: bool = False,
         begins: bool = True,
     ) -> None:
-        """Record a command's result; ``begins``: whether it began the operation that its answer names."""
+        """Record a command's result; a stop's begins no operation, though its answer names one."""
         caller = sent.caller
         operation = None if answer is None else _operation_of(answer)
         if command.goes_on and error is None and (operation is None or operation in self._began):

@@ -9,6 +9,7 @@ Reading (`LeaseTable.control`) takes no lock.
 
 from __future__ import annotations
 
+import contextlib
 import hmac
 import logging
 import math
@@ -21,16 +22,62 @@ from datetime import UTC, datetime, timedelta
 from typing import Literal
 
 from drivers.clock import Clock
-from mastctl.answers import ControlTold, LeaseRuns
-from mastctl.control.caller import Caller
-from mastctl.errors import BadRequest, NotNow
+from mastctl.answers import ControlTold, LeaseRuns, Role
+from mastctl.errors import BadRequest, NotAllowed, NotNow, one_line
 
 log = logging.getLogger(__name__)
 
+ROLES: tuple[Role, ...] = ("view", "operate", "admin")
+
+ANONYMOUS = "anonymous"
+LONGEST_NAME = 80
+NETWORK = "network"
 SHORTEST_S, USUAL_S, LONGEST_S = 1.0, 30.0, 3600.0
 WATCH_S = 0.2  # how late what runs is stopped after its lease has run out
 AGAIN_S = 1.0  # between such stops while the head does not confirm one
 REMEMBERED = 64  # ended leases for which a refusal still states how they ended
+
+
+@dataclass(frozen=True)
+class Caller:
+    """The client of a request. Equal callers are one party.
+
+    Its ``name`` is given by the client and proves nothing. On the path that needs no token every client is
+    ``admin``. ``via``: ``loopback``, ``unix``, ``token``, ``inside`` (this process itself), ``network`` (a
+    stranger without a valid token). ``credential``: digest of its token; empty without one.
+    """
+
+    name: str = ANONYMOUS
+    role: Role = "admin"
+    via: str = "loopback"
+    address: str = field(default="", compare=False)
+    credential: str = field(default="", compare=False, repr=False)
+
+    @property
+    def stranger(self) -> bool:
+        """Whether only its address is known."""
+        return self.via == NETWORK
+
+    def may(self, role: Role) -> bool:
+        """Return whether it has the rights of ``role``."""
+        return ROLES.index(self.role) >= ROLES.index(role)
+
+    def check_may(self, role: Role, command: str) -> None:
+        """Pass a client with the rights of ``role``. Raises NotAllowed ``role``."""
+        if not self.may(role):
+            raise NotAllowed("role", f"{self.name} may {self.role}; {command} needs the role {role}")
+
+
+def client_name(header: str | None) -> str:
+    """Return the name that a client gives itself as one printable line of 80 characters at most.
+
+    `ANONYMOUS` for an empty one. Headers are read as Latin-1, and as UTF-8 where that is possible. Never
+    refuses: a stop with a strange name is a stop.
+    """
+    name = header or ""
+    with contextlib.suppress(UnicodeError):
+        name = name.encode("latin-1").decode()
+    return one_line(name, LONGEST_NAME).strip() or ANONYMOUS
 
 
 class Leased(NotNow):
@@ -203,10 +250,13 @@ class LeaseTable:
         lease = self._lease
         return lease is not None and lease.id == lease_id and not self._over_by(lease)
 
-    def check(self, lease_id: str) -> None:
-        """Pass a lease that runs now. Raises NotNow as `renew`."""
-        with self._changing():
-            self._held_by(lease_id)
+    def check(self, lease_id: str, remedy: str) -> None:
+        """Pass a lease that runs now. Raises NotNow as `renew`, with a remedy."""
+        try:
+            with self._changing():
+                self._running_lease(lease_id)
+        except NotNow as over:
+            raise NotNow(over.code, f"{over}{remedy}") from None
 
     def renew(self, lease_id: str, for_s: float | None = None) -> Lease:
         """Have a lease run for ``for_s`` seconds from now on, by default as long as at first; return it.
@@ -217,7 +267,7 @@ class LeaseTable:
         if for_s is not None:
             _check_time(for_s)
         with self._changing():
-            lease = self._held_by(lease_id)
+            lease = self._running_lease(lease_id)
             for_s = lease.for_s if for_s is None else for_s
             self._lease = replace(lease, for_s=for_s, until_s=self._clock.now_s() + for_s)
             return self._lease
@@ -225,7 +275,7 @@ class LeaseTable:
     def release(self, lease_id: str) -> None:
         """End a lease and stop what runs under it. Raises NotNow as `renew`; DriverError."""
         with self._changing():
-            self._held_by(lease_id)
+            self._running_lease(lease_id)
             self._end("it was released")
         self.stop_left_running()
 
@@ -265,7 +315,7 @@ class LeaseTable:
         lease: Lease | None = None
         with self._changing():
             if lease_id is not None:
-                lease = self._held_by(lease_id)
+                lease = self._running_lease(lease_id)
             else:
                 self._check_free(caller)
             party = caller.name if lease is None else lease.holder
@@ -318,7 +368,7 @@ class LeaseTable:
         if control is not None and (control.kind == "lease" or control.holder != caller.name):
             raise Leased(control, self._clock.now_s())
 
-    def _held_by(self, lease_id: str) -> Lease:
+    def _running_lease(self, lease_id: str) -> Lease:
         """Return the lease that runs, if it is this one."""
         lease = self._lease
         if lease is not None and hmac.compare_digest(lease.id.encode(), lease_id.encode()):

@@ -1,11 +1,10 @@
 """Operations: one at a time, in a thread of its own, each with a record of what it did.
 
-This module does not know how to point. It runs what it is given, keeps the record, and makes sure that a
+This module does not know how to point. It runs the work that it gets, keeps the record, and makes sure that a
 stop is final: from its request until the operation has ended, no move goes out.
 
 Records are read without a lock: they are a mapping that is replaced, never edited. The lock is for those that
-write, and is not kept while anything else is waited for. The machine (`mastctl.control.machine`) gets what
-runs and what is being stopped, its publisher each change of a record.
+write, and is not kept while anything else is waited for.
 """
 
 from __future__ import annotations
@@ -16,26 +15,89 @@ import secrets
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from calib.errors import CalibError
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import DriverError
-from mastctl.answers import OperationState
-from mastctl.control.machine import Need, StateMachine
-from mastctl.control.records import Operation, last_residual
-from mastctl.control.standing import CLOSING
+from mastctl.answers import OperationListed, OperationState, OperationTold
+from mastctl.as_json import as_json
+from mastctl.control.machine import CLOSING, Need, Residual, StateMachine
 from mastctl.errors import MastctlError, NotKnown, NotNow, Stopped, Unable, error_body
 
 log = logging.getLogger(__name__)
 
 KEPT_OPERATIONS = 200
 END_TIMEOUT_S = 5.0  # for a cancelled operation to notice, when the service closes
-REASON_S = 2.0  # how long the record of an operation waits for the reason of a stop that came without it
 ENDS_SOON_S = 2.0  # a stopped operation ends its computation first; the next command waits for that
 
-STOP_ASKED = "a stop was requested"
+STOP_REQUESTED = "a stop was requested"
+
+
+@dataclass(frozen=True, eq=False)
+class Operation:
+    """One operation's record so far; replaced as it goes on, never edited. Times of CLOCK_MONOTONIC."""
+
+    id: str
+    state: OperationState
+    request: Mapping[str, Any]
+    created_s: float
+    started_s: float | None = None
+    ended_s: float | None = None
+    steps: tuple[Any, ...] = ()
+    result: Any = None
+    error: Mapping[str, Any] | None = None
+
+    def listed(self) -> OperationListed:
+        """Return the record as JSON without its steps; in front the last pointing's residual."""
+        made = as_json(self.result)
+        result = made if isinstance(made, dict) else {}
+        pointings = result.get("pointings") or []
+        last = pointings[-1] if pointings else {}
+        record: OperationListed = {
+            "id": self.id,
+            "state": self.state,
+            "request": as_json(self.request),
+            "created_s": self.created_s,
+            "started_s": self.started_s,
+            "ended_s": self.ended_s,
+            "error": as_json(self.error),
+            "residual_px": last.get("residual_px"),
+            "residual_sigma_px": last.get("residual_sigma_px"),
+            "position_m": result.get("position_m"),
+            "range_m": result.get("range_m"),
+            "range_from": result.get("range_from", ""),
+            "range_interval_m": result.get("range_interval_m"),
+            "pointings": pointings,
+        }
+        if "ended_because" in result:
+            record["ended_because"] = result["ended_because"]
+        return record
+
+    def as_json(self) -> OperationTold:
+        """Return the record as JSON with its steps."""
+        return {**self.listed(), "steps": as_json(self.steps)}
+
+
+def last_residual(result: Any, name: str) -> Residual | None:
+    """Return the residual that a result ends with, if it measured one."""
+    last = as_json(_last_pointing(result))
+    residual, sigma = last.get("residual_px"), last.get("residual_sigma_px")
+    if not (residual and sigma and None not in residual and None not in sigma):
+        return None
+    return Residual((residual[0], residual[1]), (sigma[0], sigma[1]), name)
+
+
+def last_frame(result: Any) -> str | None:
+    """Return the id of the image that a result ends with, None where it took none."""
+    return _last_pointing(result).get("frame_id") or None
+
+
+def _last_pointing(result: Any) -> Mapping[str, Any]:
+    """The last pointing of a result that has some, an empty one of any other."""
+    pointings = result.get("pointings") if isinstance(result, Mapping) else None
+    return pointings[-1] if pointings else {}
 
 
 class Mover(Protocol):
@@ -53,9 +115,9 @@ OnEnd = Callable[[Operation], None]
 class OperationRunner:
     """The operations of this run of the service; safe to use from any thread.
 
-    ``run``: A part of every id, so that an id from before a restart names nothing; a random one by default;
-    ``on_ended``: gets the last record of each operation, in its thread; must return at once; ``machine``:
-    gets what runs, and refuses what may not begin now; one of its own by default.
+    ``run`` is part of every id, so that an id from before a restart names nothing; random by default.
+    ``on_ended`` gets the last record of each operation, in its thread, and must return at once. ``machine``
+    gets what runs, and refuses what may not begin now.
     """
 
     def __init__(
@@ -82,9 +144,7 @@ class OperationRunner:
         self._stops_of_its_own = 0  # under way, for operations beyond their deadline
         self._deadline: tuple[str, float, MastctlError] | None = None  # of an operation; what ends it then
         self._time.thread(self._watch, "deadlines").start()
-        self._cancelled_because: MastctlError = Stopped(STOP_ASKED)
-        self._reason_is_known = threading.Event()
-        self._reason_is_known.set()
+        self._cancelled_because: MastctlError = Stopped(STOP_REQUESTED)
 
     @property
     def running(self) -> str | None:
@@ -117,34 +177,27 @@ class OperationRunner:
         return operation
 
     @contextmanager
-    def held(self) -> Iterator[None]:
+    def stopping(self) -> Iterator[None]:
         """Let no operation start and no move go out inside the block; waits for nothing."""
-        hold = object()
+        holder = object()
         self._machine.stop_requested()
-        self._mover.block_moves(hold, STOP_ASKED)
+        self._mover.block_moves(holder, STOP_REQUESTED)
         try:
             yield
         finally:
-            self._mover.allow_moves(hold)
+            self._mover.allow_moves(holder)
             self._machine.stop_ended()
 
-    def stop(
-        self,
-        reason: str = STOP_ASKED,
-        reason_follows: bool = False,
-        also: Callable[[], object] = lambda: None,
-    ) -> str | None:
+    def stop(self, reason: str = STOP_REQUESTED, also: Callable[[], object] = lambda: None) -> str | None:
         """Stop the mast, then the running operation, if any, and what ``also`` ends; return its id.
 
         The head comes first: nothing is written before its stop was sent. ``reason`` goes into the
-        operation's record; if a better ``reason_follows``, the record waits for it (`explain`). Raises
-        DriverError if the head did not confirm the stop; the operation is stopped all the same.
+        operation's record. Raises DriverError if the head did not confirm the stop; the operation is stopped
+        all the same.
         """
-        with self.held():
+        with self.stopping():
             running = self._current
             if running is not None:  # what ends from here on, ends by the stop
-                known = self._reason_is_known  # one that never came keeps no later stop waiting
-                (known.clear if reason_follows else known.set)()
                 self._cancelled_because = Stopped(reason)
                 running[1].set()
             try:
@@ -157,12 +210,6 @@ class OperationRunner:
             name = running[0]
         log.info("stop%s", f": operation {name}" if name else "")
         return name
-
-    def explain(self, reason: str | None) -> None:
-        """Give the reason of the last stop, which came without it; None for no better one."""
-        if reason is not None:
-            self._cancelled_because = Stopped(reason)
-        self._reason_is_known.set()
 
     def refusal(self, need: Need) -> MastctlError | None:
         """Return the refusal of a command, as `StateMachine.refusal`; what was stopped may end first."""
@@ -214,7 +261,7 @@ class OperationRunner:
                 self._deadline = None
             self._end_by(name, late)
 
-    def end_stopped(self, name: str, reason: str = STOP_ASKED) -> None:
+    def end_stopped(self, name: str, reason: str = STOP_REQUESTED) -> None:
         """Stop the mast and end an operation if it runs: it began after a stop, or is of no use any more."""
         self._end_by(name, Stopped(reason))
 
@@ -224,7 +271,7 @@ class OperationRunner:
         Raises as `get`; DriverError if the head did not confirm the stop.
         """
         self.get(name)
-        error = self._end_by(name, Stopped(STOP_ASKED))
+        error = self._end_by(name, Stopped(STOP_REQUESTED))
         if error is not None:
             raise error
 
@@ -352,7 +399,6 @@ class OperationRunner:
         self._stop_anyway(f"after operation {name}")
         partial = getattr(error, "result", None)
         if cancelled.is_set():
-            self._reason_is_known.wait(REASON_S)
             error = self._cancelled_because
         body = error_body(error)
         if isinstance(error, Stopped) and cancelled.is_set():

@@ -5,11 +5,11 @@ between, never the newest, and knows how many it lost: `Publisher.publish` neith
 listener that counts may request every value, up to a bound beyond which it loses the oldest.
 
     topic       key                 value
-    state       "machine"           `mastctl.control.standing.Standing`
+    state       "machine"           `mastctl.control.machine.Standing`
     joints      the head's name     `drivers.interfaces.Reading`
-    operation   its id              `mastctl.control.records.Operation`, with the steps so far
+    operation   its id              `mastctl.control.operations.Operation`, with the steps so far
     track       "track"             `mastctl.motion.track.TrackStatus`
-    fault       of a device, file   tuple of `mastctl.control.standing.StandingFault`, empty when healthy
+    fault       of a device, file   tuple of `mastctl.control.machine.StandingFault`, empty when healthy
     frame       the camera's name   facts of its newest frame, without the picture
     mast        "in_use"            the mast file in use, as `GET /mast` has it
     command     its number          the record of a command; under NUMBER.end how what it began has ended

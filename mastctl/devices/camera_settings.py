@@ -13,7 +13,7 @@ from typing import Any
 from drivers.clock import Clock
 from drivers.errors import BadReply, BadSetting, DriverError
 from drivers.interfaces import SETTINGS, Camera, CameraSetting
-from mastctl.control.standing import StandingFault
+from mastctl.control.machine import StandingFault
 from mastctl.devices.frames import check_known
 from mastctl.devices.thread import DeviceThread
 from mastctl.errors import NotNow

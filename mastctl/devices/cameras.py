@@ -24,7 +24,7 @@ from drivers.clock import Clock
 from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame
 from drivers.frame_times import Offset, Pace, Pairing, learned
 from drivers.interfaces import Camera, Frame, FrameTime, Reading
-from mastctl.control.standing import StandingFault
+from mastctl.control.machine import StandingFault
 from mastctl.devices import frames as frame_checks
 from mastctl.devices.camera_settings import CameraControls
 from mastctl.devices.frames import KEPT_FRAMES, REQUESTED, FrameStore, StampedFrame

@@ -19,8 +19,7 @@ from drivers.clock import Clock, deadlines_on
 from drivers.errors import BadReply, DriverError, LineLost, NoReply
 from drivers.interfaces import COARSE_COUNT_RAD, AxisReport, Camera, PanTilt
 from drivers.options import is_number
-from mastctl.control.machine import StateMachine
-from mastctl.control.standing import StandingFault
+from mastctl.control.machine import StandingFault, StateMachine
 from mastctl.devices import joint_history
 from mastctl.devices.cameras import Cameras
 from mastctl.devices.fault_watch import FaultWatch

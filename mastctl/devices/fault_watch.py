@@ -6,8 +6,7 @@ import threading
 from collections.abc import Callable, Sequence
 
 from drivers.clock import Clock
-from mastctl.control.machine import StateMachine
-from mastctl.control.standing import StandingFault, same_faults
+from mastctl.control.machine import StandingFault, StateMachine, same_faults
 
 ENDS_S = 1.0
 LOOK_S = 0.1  # a call is overdue by the clock alone; so late that may show

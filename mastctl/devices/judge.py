@@ -20,7 +20,7 @@ from drivers.clock import Clock
 from drivers.errors import BadOptions
 from drivers.interfaces import AxisMotion, PanTilt, Reading
 from mastctl.answers import SunTold
-from mastctl.control.standing import StandingFault
+from mastctl.control.machine import StandingFault
 from mastctl.devices.keep_out import Box, KeepOuts, KeptOut, Pair, Span
 from mastctl.devices.limits import SUN, Limits, SunDirection, sun_boxes
 

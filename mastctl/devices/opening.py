@@ -22,7 +22,7 @@ from drivers.interfaces import Camera, HeadInfo, PanTilt, Reading
 from drivers.open_hardware import open_hardware
 from drivers.open_hardware import open_one_camera as open_one_camera
 from drivers.serial_line import stable_name
-from mastctl.control.standing import latched_sentence
+from mastctl.control.machine import latched_sentence
 from mastctl.devices.devices import HEAD, Devices
 from mastctl.devices.judge import KeepOutJudge
 from mastctl.devices.limits import Limits, SunDirection

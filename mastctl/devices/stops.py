@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, LineLost, NoReply
-from mastctl.control.standing import StandingFault
+from mastctl.control.machine import StandingFault
 from mastctl.devices.thread import DeviceThread, log
 from mastctl.errors import MastctlError, Stopped
 

@@ -19,7 +19,7 @@ from typing import Any, Generic, TypeVar
 
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, LineLost, NoReply
-from mastctl.control.standing import StandingFault
+from mastctl.control.machine import StandingFault
 from mastctl.errors import MastctlError, one_line
 
 log = logging.getLogger(__name__)

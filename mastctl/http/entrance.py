@@ -14,7 +14,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from mastctl.config import is_loopback
-from mastctl.control.caller import NETWORK, Caller, client_name
+from mastctl.control.lease import NETWORK, Caller, client_name
 from mastctl.errors import NotAllowed, NotLetIn
 from mastctl.http.access import Access
 from mastctl.http.tokens import Token

@@ -16,7 +16,7 @@ from urllib.parse import parse_qsl
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from mastctl.control.caller import Caller
+from mastctl.control.lease import Caller
 from mastctl.errors import BadRequest, MastctlError, NotAllowed, one_line
 from mastctl.http import PREFIX
 from mastctl.http.entrance import EntryRules, changes, check_site, shown_token

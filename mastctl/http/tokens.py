@@ -23,7 +23,7 @@ from calib.errors import BadFile
 from calib.files.atomic import remove, replace_bytes
 from calib.files.records import Record, read_value
 from mastctl.answers import Role
-from mastctl.control.caller import ROLES
+from mastctl.control.lease import ROLES
 from mastctl.errors import MastctlError
 from mastctl.safety.state_folder import StateFile
 

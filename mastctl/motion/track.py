@@ -24,8 +24,7 @@ from drivers.clock import Clock
 from mastctl.answers import PoseTold, TrackStands, TrackState
 from mastctl.as_json import as_json
 from mastctl.control.machine import StateMachine
-from mastctl.control.operations import OperationRunner
-from mastctl.control.records import Operation
+from mastctl.control.operations import Operation, OperationRunner
 from mastctl.devices.limits import Limits
 from mastctl.errors import BadRequest, MastctlError, NotNow
 from mastctl.motion.measurement import DevicesLike

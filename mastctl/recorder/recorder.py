@@ -25,8 +25,8 @@ from typing import Any, TypeVar
 from drivers.clock import Clock
 from mastctl.answers import RecorderState, RecordingDeleted, RecordingEnded, RecordingListed, Recordings
 from mastctl.as_json import readable
+from mastctl.control.machine import StandingFault
 from mastctl.control.publisher import TOPICS, Published, Publisher, Topic
-from mastctl.control.standing import StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError, NotKnown, NotNow, Unable
 from mastctl.recorder.entries import AttachedMast, Entries, Entry

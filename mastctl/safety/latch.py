@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.errors import BadFile
-from mastctl.control.standing import Latched, latched_sentence
+from mastctl.control.machine import Latched, latched_sentence
 from mastctl.errors import NotNow, Stopped, Unable, one_line
 from mastctl.safety.state_folder import StateFile, StateFolder
 

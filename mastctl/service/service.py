@@ -26,14 +26,11 @@ from mastctl.bench.operation import BenchOperation
 from mastctl.bench.reports import Reports
 from mastctl.config import Config
 from mastctl.control.audit import STRANGERS, STRANGERS_FILES, AuditLog
-from mastctl.control.entry import CommandEntry
-from mastctl.control.idempotency import Answers
+from mastctl.control.entry import Answers, CommandEntry
 from mastctl.control.lease import LeaseTable, Steerer
-from mastctl.control.machine import StateMachine
-from mastctl.control.operations import OperationRunner
+from mastctl.control.machine import StandingFault, StateMachine
+from mastctl.control.operations import Operation, OperationRunner, last_frame
 from mastctl.control.publisher import Topic
-from mastctl.control.records import Operation, last_frame
-from mastctl.control.standing import StandingFault
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import OPERATIONS, StampedFrame, check_known, random_run
 from mastctl.devices.opening import open_rig

@@ -6,8 +6,8 @@ from typing import Any
 
 from mastctl.answers import CameraTold, FaultTold, HeadTold, MeasuredJoints, StandingTold, StateTold
 from mastctl.as_json import as_json
+from mastctl.control.machine import Standing, StandingFault
 from mastctl.control.publisher import Topic
-from mastctl.control.standing import Standing, StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 

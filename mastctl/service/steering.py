@@ -11,8 +11,7 @@ from typing import Any, TypeVar
 from calib.geometry.rig import Rig
 from drivers.clock import Clock
 from mastctl.answers import Preview
-from mastctl.control.operations import OperationRunner
-from mastctl.control.records import Operation
+from mastctl.control.operations import Operation, OperationRunner
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import check_known
 from mastctl.devices.limits import Limits

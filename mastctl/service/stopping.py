@@ -10,11 +10,10 @@ from collections.abc import Iterator
 
 from drivers.errors import DriverError
 from mastctl.answers import EstopTold, ResetTold, StopTold
-from mastctl.control.caller import Caller
 from mastctl.control.entry import ESTOP, STOP, CommandEntry, CommandRequest
-from mastctl.control.machine import StateMachine
-from mastctl.control.operations import STOP_ASKED, OperationRunner
-from mastctl.control.standing import Latched, StandingFault, latched_sentence
+from mastctl.control.lease import Caller
+from mastctl.control.machine import Latched, StandingFault, StateMachine, latched_sentence
+from mastctl.control.operations import STOP_REQUESTED, OperationRunner
 from mastctl.devices.devices import Devices
 from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.motion.track import Tracker
@@ -50,12 +49,12 @@ class Stopping:
         self._blocking = threading.Lock()
         self._block_moves()
 
-    def stop(self, reason: str = STOP_ASKED, reason_follows: bool = False) -> str | None:
+    def stop(self, reason: str = STOP_REQUESTED) -> str | None:
         """Stop the mast, then what runs and the track; return the stopped operation's id.
 
         Raises DriverError.
         """
-        return self._operations.stop(reason, reason_follows, lambda: self._tracker.stop(reason))
+        return self._operations.stop(reason, lambda: self._tracker.stop(reason))
 
     def stop_answer(self) -> StopTold:
         """Stop as `stop`; return the answer of ``POST /stop``."""
@@ -70,23 +69,22 @@ class Stopping:
         if running is not None and self._operations.running == running:
             self._operations.stop()
 
-    def estop(
-        self, reason: str | None = None, name: str | None = None, reason_follows: bool = False
-    ) -> EstopTold:
+    def estop(self, reason: str | None = None, name: str | None = None) -> EstopTold:
         """Stop the mast, and let nothing move it before `reset`, across restarts too.
 
-        The head first; then what runs and the track end; then the disk is waited for. If its
-        ``reason_follows``, `explain_estop` comes next, with a reason or without.
+        The head first; then what runs and the track end; then the disk is waited for. A reason may follow
+        (`explain_estop`).
 
         Returns the answer of ``POST /estop``: ``latched``, ``kept`` (a restart would find it; else
         ``message`` says why not), ``operation``, and ``reason``, ``name`` and ``at`` of the stop that is
         latched. Raises Unable ``stop_unconfirmed`` if the head did not confirm; it is latched all the same.
         """
         stopped, unconfirmed = None, None
-        with self._operations.held():
+        with self._operations.stopping():
             cause = self.latch_estop(reason, name)
             try:
-                stopped = self.stop(f"an emergency stop: {cause.reason} ({cause.name})", reason_follows)
+                given = f": {cause.reason} ({cause.name})" if reason or name else " was requested"
+                stopped = self.stop(f"an emergency stop{given}")
             except (DriverError, MastctlError) as error:
                 unconfirmed = error
         self._latch.head_stopped()
@@ -110,28 +108,22 @@ class Stopping:
 
     def latch_estop(self, reason: str | None, name: str | None) -> Latched:
         """Let no move out from now on; `estop` stops the head. Returns the cause that is latched."""
-        self._machine.stop_requested()
-        try:
+        with self._operations.stopping():
             cause = self._latch.add(reason, name)
-            self._machine.estop_requested(self._causes)
-            self._block_moves()
-        finally:
-            self._machine.stop_ended()
+            self._latch_changed()
         return cause
 
     def explain_estop(self, reason: str | None, name: str | None) -> Latched | None:
         """Add the name and the reason that came after their stop; return its cause if that has changed."""
-        cause, sentence = self._latch.explain(reason, name) if reason or name else None, None
+        cause = self._latch.explain(reason, name) if reason or name else None
         if cause is not None:  # else there is none left to explain, after a reset for example
-            sentence = f"an emergency stop: {cause.reason} ({cause.name})"
-            self._machine.stop_requested()
-            try:
-                self._machine.estop_requested(self._causes)
-                self._block_moves()
-            finally:
-                self._machine.stop_ended()
-        self._operations.explain(sentence)
+            with self._operations.stopping():
+                self._latch_changed()
         return cause
+
+    def _latch_changed(self) -> None:
+        self._machine.estop_requested(lambda: self._latch.entries)
+        self._block_moves()
 
     def reset(self, reason: str, name: str) -> ResetTold:
         """Release the emergency stop; nothing moves before a command comes.
@@ -150,11 +142,8 @@ class Stopping:
         with self._resetting:
             causes = self._latch.release(reason, name)
             self._block_moves()
-            self._machine.reset(name, reason, self._causes)
+            self._machine.reset(name, reason, lambda: self._latch.entries)
             return {"latched": bool(self._latch.entries), "released": causes[0].as_json()}
-
-    def _causes(self) -> tuple[Latched, ...]:
-        return self._latch.entries
 
     def _block_moves(self) -> None:
         """Refuse moves while anything is latched; after each change of the latch, and in turn."""

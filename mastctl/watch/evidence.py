@@ -34,7 +34,7 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, ReadOnlyArrays, tangents
 from drivers.interfaces import COARSE_COUNT_RAD
 from mastctl.answers import MeasuredPointing
-from mastctl.control.records import Operation
+from mastctl.control.operations import Operation
 from mastctl.watch.journal import Journal
 
 DISAGREE = "eyes_disagree"

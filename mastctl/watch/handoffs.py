@@ -33,7 +33,7 @@ from calib.matching.handoff import RefinedVerdict
 from drivers.clock import Clock
 from drivers.recordings.mcap_file import BadRecording, is_mcap, read_messages
 from mastctl.answers import OffsetTold, SelfCheck
-from mastctl.control.standing import StandingFault
+from mastctl.control.machine import StandingFault
 from mastctl.watch.journal import Journal, JournalThread
 
 log = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ from typing import Any, Generic, TypeVar
 from calib.errors import BadFile
 from calib.files.atomic import replace_bytes
 from drivers.clock import Clock, SystemClock
-from mastctl.control.standing import StandingFault
+from mastctl.control.machine import StandingFault
 from mastctl.json_lines import OtherFile, append_line, read_lines
 
 log = logging.getLogger(__name__)

@@ -22,8 +22,8 @@ from prometheus_client.core import (
 from prometheus_client.process_collector import ProcessCollector
 
 from mastctl.answers import Status, Word
+from mastctl.control.operations import Operation
 from mastctl.control.publisher import Published, Publisher
-from mastctl.control.records import Operation
 
 log = logging.getLogger(__name__)
 

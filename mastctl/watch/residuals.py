@@ -28,7 +28,7 @@ from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from mastctl.answers import CalibrationTold, CountedPointing, ResidualVerdict, SelfCheck, SentinelTold
-from mastctl.control.records import Operation
+from mastctl.control.operations import Operation
 from mastctl.watch.evidence import (
     Evidence,
     Expected,

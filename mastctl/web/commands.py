@@ -13,9 +13,8 @@ from typing import Annotated, Any, TypeVar
 from fastapi import Depends, FastAPI, Header, Request
 from pydantic import BaseModel
 
-from mastctl.control.caller import Caller, client_name
-from mastctl.control.entry import Command, CommandRequest
-from mastctl.control.idempotency import Answer
+from mastctl.control.entry import Answer, Command, CommandRequest
+from mastctl.control.lease import Caller, client_name
 from mastctl.errors import Unable
 from mastctl.http import PREFIX
 from mastctl.motion.requests import DeadlineS
@@ -162,7 +161,7 @@ async def stop_first(
                 asked = replace(asked, request=await late())
         finally:
             if late is not None or isinstance(failure, StopsHang):
-                entry.note(kind, asked, answer, failure)
+                entry.record(kind, asked, answer, failure, begins=False)
 
 
 async def stopped(service: Service, stop: Callable[[], T]) -> T:

@@ -20,7 +20,7 @@ from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
 from mastctl.as_json import writable
-from mastctl.control.caller import Caller
+from mastctl.control.lease import Caller
 from mastctl.control.publisher import LoopSubscription, Published, Topic
 from mastctl.http import PREFIX
 from mastctl.http.refusals import query_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import FastAPI, Request, Response
 
 from mastctl.answers import ClientSession
-from mastctl.control.caller import Caller
+from mastctl.control.lease import Caller
 from mastctl.http import PREFIX
 from mastctl.http.entrance import cookie_name, shown_token
 from mastctl.web.parts import Here

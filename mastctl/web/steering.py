@@ -27,7 +27,6 @@ from mastctl.answers import (
     SunTold,
     TrackTold,
 )
-from mastctl.control.caller import client_name
 from mastctl.control.entry import (
     ESTOP,
     JOG,
@@ -47,8 +46,8 @@ from mastctl.control.entry import (
     TRACK_STOP,
     CommandRequest,
 )
-from mastctl.control.lease import Lease, LeaseTable
-from mastctl.control.standing import Latched
+from mastctl.control.lease import Lease, LeaseTable, client_name
+from mastctl.control.machine import Latched
 from mastctl.errors import BadRequest, NotNow, Unable, one_line
 from mastctl.http import PREFIX
 from mastctl.motion.jog import JogBeat
@@ -149,7 +148,7 @@ def add_estop(app: FastAPI) -> None:
         await asyncio.wait([reading], timeout=0)  # one turn of the loop: what came with the request is read
         follows = not reading.done()
         given = {"reason": None, "name": None} if follows else reading.result()
-        stop = partial(stopping.estop, **given, reason_follows=follows)
+        stop = partial(stopping.estop, **given)
         cause: Latched | None = None
 
         async def late() -> dict[str, str | None]:

@@ -25,7 +25,7 @@ from hil_tests.mastctl.bench.operation_world import (
     writes_files,
 )
 from hil_tests.waiting import until
-from mastctl.control.caller import Caller
+from mastctl.control.lease import Caller
 from mastctl.errors import NotKnown, NotNow
 
 BO = Caller("Bo", "operate")

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from mastctl.control.caller import ANONYMOUS, LONGEST_NAME, ROLES, Caller, client_name
+from mastctl.control.lease import ANONYMOUS, LONGEST_NAME, ROLES, Caller, client_name
 from mastctl.errors import NotAllowed
 
 

@@ -13,10 +13,18 @@ from drivers.clock import ManualClock
 from drivers.errors import NoReply
 from hil_tests.waiting import NET_S
 from mastctl.control.audit import AuditLog
-from mastctl.control.caller import Caller
-from mastctl.control.entry import ESTOP, JOG, POINT, POSE, STOP, Command, CommandEntry, CommandRequest
-from mastctl.control.idempotency import Answers
-from mastctl.control.lease import LeaseTable
+from mastctl.control.entry import (
+    ESTOP,
+    JOG,
+    POINT,
+    POSE,
+    STOP,
+    Answers,
+    Command,
+    CommandEntry,
+    CommandRequest,
+)
+from mastctl.control.lease import Caller, LeaseTable
 from mastctl.control.publisher import Publisher
 from mastctl.errors import MastctlError, NotNow
 

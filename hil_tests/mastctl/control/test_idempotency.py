@@ -11,7 +11,7 @@ from drivers.clock import ManualClock
 from drivers.errors import NoReply
 from drivers.simulation_clock import SimulationClock
 from hil_tests.waiting import NET_S, joined
-from mastctl.control.idempotency import Answers
+from mastctl.control.entry import Answers
 from mastctl.errors import BadRequest, NotNow
 
 SAME = {"command": "point", "request": {"pan_rad": 0.1}}

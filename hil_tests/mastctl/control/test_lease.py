@@ -11,8 +11,7 @@ from drivers.clock import ManualClock, SystemClock
 from drivers.errors import NoReply
 from hil_tests.waiting import joined, until
 from mastctl.control import lease as lease_module
-from mastctl.control.caller import Caller
-from mastctl.control.lease import LONGEST_S, SHORTEST_S, Lease, Leased, LeaseTable, Steerer
+from mastctl.control.lease import LONGEST_S, SHORTEST_S, Caller, Lease, Leased, LeaseTable, Steerer
 from mastctl.errors import BadRequest, MastctlError, NotNow
 
 BENCH = Caller("bench")

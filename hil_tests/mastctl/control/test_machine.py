@@ -10,9 +10,8 @@ import pytest
 
 from drivers.clock import ManualClock
 from mastctl.answers import Word
-from mastctl.control.machine import StateMachine
+from mastctl.control.machine import Latched, Residual, Standing, StandingFault, StateMachine
 from mastctl.control.publisher import Publisher, Topic
-from mastctl.control.standing import Latched, Residual, Standing, StandingFault
 from mastctl.errors import MastctlError, NotNow, Unable
 
 LATCH = Latched("Ana", "a hand in the way", "2026-01-02T03:04:05Z")

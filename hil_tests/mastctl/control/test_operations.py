@@ -12,10 +12,8 @@ from drivers.clock import ManualClock
 from drivers.errors import NoReply
 from hil_tests.mastctl.service_fakes import fake_result
 from hil_tests.waiting import NET_S, joined, present, until
-from mastctl.control.machine import StateMachine
-from mastctl.control.operations import KEPT_OPERATIONS, STOP_ASKED, OperationRunner
-from mastctl.control.records import Operation
-from mastctl.control.standing import CLOSING, Residual
+from mastctl.control.machine import CLOSING, Residual, StateMachine
+from mastctl.control.operations import KEPT_OPERATIONS, STOP_REQUESTED, Operation, OperationRunner
 from mastctl.errors import NotKnown, NotNow, Stopped, Unable, error_body
 
 
@@ -77,19 +75,18 @@ def pointed(*residuals: Any) -> dict[str, Any]:
 
 
 def test_a_stop_blocks_and_halts_before_it_ends_what_runs(
-    operations: OperationRunner, mover: Mover, machine: StateMachine, monkeypatch: pytest.MonkeyPatch
+    operations: OperationRunner, mover: Mover, machine: StateMachine
 ) -> None:
-    monkeypatch.setattr("mastctl.control.operations.REASON_S", 2.0 * NET_S)  # a reason that never comes
     name = operations.start({}, until_cancelled).id
     until(lambda: operations.get(name).steps, "its step")
     seen: list[Any] = []
     mover.hook = lambda _: seen.append((dict(mover.blocks).values(), machine.standing.state))
-    assert operations.stop(reason_follows=True) == operations.stop() == name
-    assert mover.told[:2] == [("block", STOP_ASKED), ("stop", None)]
-    assert [(list(blocks), word) for blocks, word in seen[:1]] == [([STOP_ASKED], "stopping")]
+    assert operations.stop() == name
+    assert mover.told[:2] == [("block", STOP_REQUESTED), ("stop", None)]
+    assert [(list(blocks), word) for blocks, word in seen[:1]] == [([STOP_REQUESTED], "stopping")]
     record = ended(operations, name)
     assert record.state == "stopped" and record.steps == ("it waits",)
-    assert record.error is not None and STOP_ASKED in record.error["message"]
+    assert record.error is not None and STOP_REQUESTED in record.error["message"]
     assert mover.blocks == {}, "moves are taken again"
     assert word(machine) == "holding"
 
@@ -105,7 +102,7 @@ def test_no_move_goes_out_between_a_stop_and_the_end_of_what_it_stopped(
 
     name = operations.start({}, slow).id
     operations.stop()
-    assert list(mover.blocks.values()) == [STOP_ASKED]
+    assert list(mover.blocks.values()) == [STOP_REQUESTED]
     assert word(machine) == "stopping"
     with pytest.raises(NotNow, match="is being stopped"):
         operations.start({}, slow)
@@ -146,14 +143,14 @@ def test_an_operation_that_ends_during_a_stop_was_stopped_by_it(
     mover.hook = until_it_has_ended
     name = operations.start({}, refused).id
     assert operations.stop() == name
-    assert operations.get(name).error == error_body(Stopped(STOP_ASKED))
+    assert operations.get(name).error == error_body(Stopped(STOP_REQUESTED))
 
 
-def test_nothing_starts_while_a_stop_is_held(
+def test_nothing_starts_while_a_stop_is_under_way(
     operations: OperationRunner, mover: Mover, machine: StateMachine
 ) -> None:
-    with operations.held():
-        assert word(machine) == "stopping" and list(mover.blocks.values()) == [STOP_ASKED]
+    with operations.stopping():
+        assert word(machine) == "stopping" and list(mover.blocks.values()) == [STOP_REQUESTED]
         with pytest.raises(NotNow, match="the mast is being stopped") as refused:
             operations.start({}, until_cancelled)
         assert refused.value.code == "stopping"
@@ -356,7 +353,7 @@ def test_a_stop_before_the_deadline_is_the_last_word(mover: Mover, operations: O
     record = ended(operations, name)
     assert mover.told[before:] == [("stop", None)], "by the operation itself, as it ends"
     assert record.state == "stopped"
-    assert record.error == error_body(Stopped(STOP_ASKED))
+    assert record.error == error_body(Stopped(STOP_REQUESTED))
 
 
 def test_a_stop_after_the_deadline_is_sent_all_the_same(

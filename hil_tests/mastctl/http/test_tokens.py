@@ -12,7 +12,7 @@ import pytest
 
 from calib.errors import BadFile
 from hil_tests.waiting import joined
-from mastctl.control.caller import ROLES
+from mastctl.control.lease import ROLES
 from mastctl.http.tokens import TokenList, TokenRefused
 
 

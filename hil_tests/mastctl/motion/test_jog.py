@@ -16,8 +16,7 @@ from drivers.interfaces import Reading
 from drivers.sim.heads import PRESETS
 from drivers.sim.pan_tilt import SimulatedPanTilt
 from drivers.simulation_clock import SimulationClock
-from mastctl.control.operations import OperationRunner
-from mastctl.control.records import Operation
+from mastctl.control.operations import Operation, OperationRunner
 from mastctl.devices.devices import Devices
 from mastctl.devices.keep_out import Box
 from mastctl.devices.limits import Limits

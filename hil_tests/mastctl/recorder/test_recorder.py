@@ -30,7 +30,7 @@ from hil_tests.mastctl.recorder.recorder_world import (
 from hil_tests.support.kills import kills
 from hil_tests.waiting import until
 from mastctl.control import publisher
-from mastctl.control.standing import StandingFault
+from mastctl.control.machine import StandingFault
 from mastctl.errors import NotNow, Unable
 from mastctl.recorder import recorder as module
 from mastctl.recorder.entries import AttachedMast, Entries

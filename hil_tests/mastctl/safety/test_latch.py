@@ -22,7 +22,7 @@ from hil_tests.mastctl.service_fakes import CONFIG, Hang, ScriptedLoop, fake_dae
 from hil_tests.waiting import NET_S, present, until
 from mastctl.client import Client, ClientError
 from mastctl.control import machine as machine_module
-from mastctl.control.standing import Latched
+from mastctl.control.machine import Latched
 from mastctl.errors import NotNow, Stopped, Unable
 from mastctl.safety import latch as latch_module
 from mastctl.safety.latch import FILE, Estopped, Latch
@@ -304,7 +304,7 @@ def test_an_emergency_stop_acts_before_its_reason_has_come(
         assert (told["reason"], told["name"]) == ("a hand", "Ana")
         (cause,) = client.status()["estops"]
         assert (cause["reason"], cause["name"]) == ("a hand", "Ana")
-        assert present(client.wait(operation)["error"])["message"] == "an emergency stop: a hand (Ana)"
+        assert present(client.wait(operation)["error"])["message"] == "an emergency stop was requested"
         until(lambda: b"a hand" in (tmp_path / "state" / FILE).read_bytes(), "the disk has it")
         assert daemon.service.audit.flush(NET_S)
         lines = map(json.loads, (tmp_path / "state" / "audit.jsonl").read_text().splitlines())

@@ -10,7 +10,7 @@ import pytest
 from hil_tests.mastctl.service_fakes import fake_daemon
 from hil_tests.waiting import until
 from mastctl.client import Client
-from mastctl.control.standing import StandingFault
+from mastctl.control.machine import StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.service.state import camera_answer, fault_answer, joints_answer

@@ -15,7 +15,7 @@ from drivers.interfaces import COARSE_COUNT_RAD
 from hil_tests.mastctl.service_fakes import fake_step
 from hil_tests.mastctl.watch.histories import NOON_S, bumped, pointing, stored_rig
 from hil_tests.waiting import until
-from mastctl.control.records import Operation
+from mastctl.control.operations import Operation
 from mastctl.watch import evidence
 from mastctl.watch.evidence import FILE, Measured, measured_by, measured_of, pointing_journal
 from mastctl.watch.journal import JournalThread

@@ -10,8 +10,8 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from hil_tests.mastctl.service_fakes import fake_result
 from hil_tests.waiting import until
+from mastctl.control.operations import Operation
 from mastctl.control.publisher import Publisher
-from mastctl.control.records import Operation
 from mastctl.watch.metrics import Metrics
 
 STATUS: Any = {

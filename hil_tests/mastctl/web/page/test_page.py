@@ -25,7 +25,7 @@ from hil_tests.mastctl.web.page.conftest import Visit
 from hil_tests.waiting import NET_S, until
 from mastctl.as_json import as_json
 from mastctl.client import Client
-from mastctl.control.caller import Caller
+from mastctl.control.lease import Caller
 from mastctl.daemon import RunningDaemon
 from mastctl.web.page import page_files
 
