@@ -114,7 +114,7 @@ class Started(TypedDict):
     id: str
 
 
-class AimTold(TypedDict):
+class AimedPixel(TypedDict):
     """Where a target would come."""
 
     camera: str
@@ -122,7 +122,7 @@ class AimTold(TypedDict):
     y_px: float
 
 
-class RefusedTold(TypedDict):
+class Refusal(TypedDict):
     """Why the head would not be sent."""
 
     code: str
@@ -153,12 +153,12 @@ class Preview(TypedDict):
     range_sigma_m: float | None
     range_from: str
     range_interval_m: list[float | None] | None
-    aim: AimTold
+    aim: AimedPixel
     goal_rad: Angles | None
-    refused: RefusedTold | None
+    refused: Refusal | None
 
 
-class JogTold(TypedDict):
+class JogAnswer(TypedDict):
     """``POST /jog``: the jog's operation, whether the heartbeat was taken, and what holds an axis."""
 
     id: str | None
@@ -190,8 +190,11 @@ class ResetTold(TypedDict):
     released: EstopHeld
 
 
-class EyeTold(TypedDict):
-    """One camera's result for the target; pixel and sigma are null without a good verdict."""
+class CameraPixel(TypedDict):
+    """What one camera saw of the target: a verdict of `calib.matching.patch`, or ``no_frame``.
+
+    Pixel and sigma are null without a good verdict.
+    """
 
     frame_id: str
     verdict: str
@@ -202,7 +205,7 @@ class EyeTold(TypedDict):
     correlation: float | None
 
 
-class HandoffTold(TypedDict):
+class Handover(TypedDict):
     """The target went from one pair to another, at a range of the new one."""
 
     from_pair: str
@@ -241,11 +244,11 @@ class TrackStands(TypedDict):
     operation: str | None
     looks: Count
     misses: Count
-    handoffs: list[HandoffTold]
+    handoffs: list[Handover]
     renewals: Count
     range_m: float | None
     pair: str | None
-    pixels: dict[str, EyeTold]
+    pixels: dict[str, CameraPixel]
     chi2: float | None
     renewed: bool
     pose_doubt: str

@@ -17,16 +17,16 @@ import threading
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any
 
 from pydantic import Field
 
 from drivers.clock import Clock
 from drivers.interfaces import Reading
-from mastctl.answers import JogTold
+from mastctl.answers import JogAnswer
 from mastctl.control.machine import busy
 from mastctl.control.operations import OperationRunner
-from mastctl.devices.judge import KeepOutJudge
+from mastctl.devices.devices import Devices
 from mastctl.devices.keep_out import KeptOut, Pair
 from mastctl.errors import NotNow
 from mastctl.motion.requests import Name, PointingError, StrictBody
@@ -60,16 +60,6 @@ class JogBeat(StrictBody):
         return self.pan_rad_per_s, self.tilt_rad_per_s
 
 
-class JogDevices(Protocol):
-    """What of `mastctl.devices.devices.Devices` a jog needs."""
-
-    @property
-    def judge(self) -> KeepOutJudge: ...
-    def read(self) -> Reading: ...
-    def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None: ...
-    def stop(self) -> None: ...
-
-
 @dataclass(frozen=True)
 class JogEnd:
     """How a jog ended: why, and where the head was when it was stopped."""
@@ -82,15 +72,15 @@ class JogEnd:
 class Jogs:
     """The jog of one daemon, at most one at a time; safe to use from any thread.
 
-    ``operations``: A jog is an operation from its first heartbeat to its end: nothing else moves the head
-    meanwhile, and a stop ends it; ``undisturbed``: A context in which a jog begins, for what needs a head
-    that rests: it changes before or after.
+    A jog is an operation from its first heartbeat to its end: nothing else moves the head meanwhile, and a
+    stop ends it. ``undisturbed`` is a context in which a jog begins: what needs a head that rests changes
+    before or after.
     """
 
     def __init__(
         self,
         operations: OperationRunner,
-        devices: JogDevices,
+        devices: Devices,
         clock: Clock,
         undisturbed: Callable[[], AbstractContextManager[object]] = nullcontext,
     ) -> None:
@@ -101,8 +91,8 @@ class Jogs:
         self._lock = threading.Lock()
         self._jog: tuple[str, _Jog] | None = None
 
-    def beat(self, beat: JogBeat) -> JogTold:
-        """Take a heartbeat; return the jog's ``id``, whether it was ``taken``, and which axis is ``held``.
+    def beat(self, beat: JogBeat) -> JogAnswer:
+        """Take a heartbeat; return the jog's ``id``, whether it was ``taken``, and which axis does not turn.
 
         Raises NotNow ``jog_ended`` if it names a jog that does not run, or none and is not the first;
         ``busy`` if an operation runs, or another jog; else as `OperationRunner.start`.
@@ -134,19 +124,16 @@ class Jogs:
 
 
 class _Jog:
-    """One jog."""
-
-    def __init__(self, devices: JogDevices, clock: Clock, first: JogBeat) -> None:
+    def __init__(self, devices: Devices, clock: Clock, first: JogBeat) -> None:
         self._devices = devices
         self._clock = clock
         self._changed = clock.signal()
         self._beat = first
         self._came_s = clock.now_s()
         self._sent: Pair | None = None
-        self._held: Mapping[str, str] = {}
+        self._bounded: Mapping[str, str] = {}
 
-    def take(self, beat: JogBeat, name: str) -> JogTold:
-        """Take a heartbeat, unless a later one came before it."""
+    def take(self, beat: JogBeat, name: str) -> JogAnswer:
         with self._changed:
             if beat.sequence <= self._beat.sequence:
                 return self.answer(name, False)
@@ -155,9 +142,8 @@ class _Jog:
                 self._changed.notify_all()
         return self.answer(name, True)
 
-    def answer(self, name: str, taken: bool) -> JogTold:
-        """Return the answer to a heartbeat."""
-        return {"id": name, "taken": taken, "held": dict(self._held)}
+    def answer(self, name: str, taken: bool) -> JogAnswer:
+        return {"id": name, "taken": taken, "held": dict(self._bounded)}
 
     def run(self, record: Callable[[Any], None], cancelled: threading.Event) -> JogEnd:
         """Turn the head until no heartbeat comes any more; then stop it.
@@ -201,7 +187,7 @@ class _Jog:
             for at, rate, stays in zip(start, rates, stay, strict=True)
         )
         goal = judge.nearest(reading, (wanted[0], wanted[1]), stay)
-        self._held = {
+        self._bounded = {
             axis: f"{axis} is held at {to:.4g} rad by a limit or a keep-out"
             for axis, to, want, rate in zip(AXES, goal, wanted, rates, strict=True)
             if rate and abs(want - to) > 1e-6

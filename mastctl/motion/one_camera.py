@@ -41,9 +41,7 @@ KNOWN_SHARE = 0.5
 
 
 class OneCamera:
-    """What one camera knows of a target during one request.
-
-    ``sight``: the newest line of sight, with its range; ``range_from``: what says how far the target is.
+    """What one camera knows of a target: the newest line of ``sight``, and what says how far the target is.
 
     Raises CalibError if the clicked pixel does not meet the plane that it is said to lie in, or has no ray.
     """

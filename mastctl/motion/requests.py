@@ -147,18 +147,10 @@ class TrackRequest(StrictBody):
 class PointRequest(TrackRequest):
     """``POST /point``: exactly one of pixel, position_m, or pan_rad with tilt_rad.
 
-    Attributes
-    ----------
-    aim
-        Where the target is wanted; by default the image centre of the clicked camera if it is on the head,
-        else of the first stereo pair's left camera on the head.
-    pointings
-        How often to point: a second one uses what the new images showed.
-    range_m
-        How far what a pixel shows is from its camera; then no other camera is needed. None: it is measured by
-        the pair, or not known where the camera is in none.
-    plane
-        Or the plane in which it lies.
+    ``aim`` is where the target is wanted; by default the image centre of the clicked camera if it is on the
+    head, else of the first stereo pair's left camera on the head. A second of the ``pointings`` uses what the
+    new images showed. ``range_m`` is how far what a pixel shows is from its camera, or ``plane`` the one in
+    which it lies: then no other camera is needed. Without them a pair measures it, or it is not known.
     """
 
     pan_rad: Angle | None = None

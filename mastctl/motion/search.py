@@ -33,7 +33,7 @@ from calib.matching.look import TrackLook, seen_by
 from calib.matching.track import Track, start_track
 from calib.matching.verdict import PatchMatch
 from drivers.clock import Clock
-from mastctl.answers import Step
+from mastctl.answers import CameraPixel, Step
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.keep_out import KeptOut, Pair
 from mastctl.devices.limits import Limits
@@ -45,6 +45,7 @@ from mastctl.motion.steps import Steps
 
 PAIRS_TRIED = 2
 """How many pairs search a target from one pose of the rover."""
+UNKNOWN_PX = np.full(2, math.nan)
 BEFORE_TIMEOUT_S = 2.0
 """An image to compare with is worth waiting for some frames, not for a camera that is gone."""
 
@@ -55,48 +56,21 @@ class NotTrackable(MastctlError):
     code = "not_trackable"
 
 
-@dataclass(frozen=True)
-class CameraPixel:
-    """What one camera saw: a verdict of `calib.matching.patch` or ``no_frame``; pixel and sigma if good."""
-
-    frame_id: str
-    verdict: str
-    reason: str = ""
-    x_px: float = math.nan
-    y_px: float = math.nan
-    sigma_px: tuple[float, float] = (math.nan, math.nan)
-    correlation: float = math.nan
-
-
 @dataclass(frozen=True, eq=False)
 class TrackSighting:
     """What a start or a look of a track saw.
 
-    Attributes
-    ----------
-    state, reason
-        ``tracked``, or ``lost`` with the reason in one sentence.
-    pair
-        Which took the images; empty if none could.
-    position_m, covariance_m2
-        (3,) and (3, 3) of the target afterwards, in the rover frame of the look.
-    range_m
-        From the middle between the pair's cameras.
-    pixels
-        By camera.
-    chi2, renewed
-        As `calib.matching.look.TrackLook`.
-    pose_doubt
-        What the images say against the pose, one sentence; empty if they do not.
-    matched
-        The target in the images of the pair before and of the next one, if both took some.
+    ``reason`` is one sentence for a target that is lost. ``pair`` took the images; empty if none could.
+    ``position_m`` is (3,) of the target afterwards, in the rover frame of the look, ``range_m`` from the
+    middle between the pair's cameras. ``chi2`` and ``renewed`` are as `calib.matching.look.TrackLook` has
+    them. ``pose_doubt`` says what the images say against the pose; empty if they do not. ``matched`` is the
+    target in the images of the pair before and of the next one, if both took some.
     """
 
     state: Literal["tracked", "lost"]
     reason: str
     pair: str
     position_m: FloatArray
-    covariance_m2: FloatArray
     range_m: float
     pixels: Mapping[str, CameraPixel] = field(default_factory=dict)
     chi2: float = math.nan
@@ -238,8 +212,12 @@ class TargetSearch(Steps):
     def _searched(self, taken: _Taken, track: Track) -> _Sight:
         with self.step("find") as detail:
             look = seen_by(track, taken.views)
-            pixels = {name: CameraPixel("", "no_frame", reason) for name, reason in taken.missing.items()}
-            pixels |= {name: _pixel(taken.views[name], found) for name, found in look.found.items()}
+            pixels = {name: _pixel("", "no_frame", reason) for name, reason in taken.missing.items()}
+            for name, match in look.found.items():
+                frame_id, at, sigma = taken.views[name].frame.frame_id, match.pixel_px, match.sigma_px
+                pixels[name] = _pixel(
+                    frame_id, match.verdict, match.reason, at, sigma, float(match.correlation)
+                )
             seen = self._sighting(taken.choice, look, pixels, taken.settled)
             detail.update(
                 pair=seen.pair, state=seen.state, reason=seen.reason, position_m=rounded(seen.position_m, 5)
@@ -252,7 +230,7 @@ class TargetSearch(Steps):
         self, choice: PairChoice, look: TrackLook, pixels: Mapping[str, CameraPixel], settled: HeadReading
     ) -> TrackSighting:
         track, reason = look.track, look.reason
-        gone = [one.reason for one in pixels.values() if one.verdict == "no_frame"]
+        gone = [one["reason"] for one in pixels.values() if one["verdict"] == "no_frame"]
         if track.state == "lost" and gone:
             reason = "; ".join([*gone, reason] if look.found else gone)
         range_m = self._range_m(choice.pair, track.position_m, settled)
@@ -261,7 +239,6 @@ class TargetSearch(Steps):
             reason,
             choice.pair,
             track.position_m,
-            track.target_covariance_m2,
             range_m,
             pixels,
             look.chi2,
@@ -315,10 +292,9 @@ class TargetSearch(Steps):
             "",
             pair,
             track.position_m,
-            track.target_covariance_m2,
             float(np.linalg.norm(track.position_m - middle)),
             {
-                view.frame.camera: CameraPixel(view.frame.frame_id, "good", "", float(at[0]), float(at[1]))
+                view.frame.camera: _pixel(view.frame.frame_id, "good", "", at)
                 for view, at in ((one, pixel_px), (other, partner))
             },
         )
@@ -328,18 +304,23 @@ class TargetSearch(Steps):
         return float(np.linalg.norm(position_m - (left.C + right.C) / 2))
 
 
-def _pixel(view: CameraView, found: PatchMatch) -> CameraPixel:
-    x, y = (float(value) for value in found.pixel_px)
-    sigma = found.sigma_px
-    return CameraPixel(
-        view.frame.frame_id,
-        found.verdict,
-        found.reason,
-        x,
-        y,
-        (float(sigma[0]), float(sigma[1])),
-        float(found.correlation),
-    )
+def _pixel(
+    frame_id: str,
+    verdict: str,
+    reason: str,
+    at_px: FloatArray = UNKNOWN_PX,
+    sigma_px: FloatArray = UNKNOWN_PX,
+    correlation: float = math.nan,
+) -> CameraPixel:
+    return {
+        "frame_id": frame_id,
+        "verdict": verdict,
+        "reason": reason,
+        "x_px": float(at_px[0]),
+        "y_px": float(at_px[1]),
+        "sigma_px": sigma_px.tolist(),
+        "correlation": correlation,
+    }
 
 
 USUAL_RULES = HandoffRules()

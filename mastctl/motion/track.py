@@ -21,7 +21,7 @@ from calib.geometry.rigid import FloatArray, Rigid, carried_covariance, quaterni
 from calib.matching.handed_over import MatchedHandoff
 from calib.matching.track import Track, moved_track
 from drivers.clock import Clock
-from mastctl.answers import PoseTold, TrackStands, TrackState
+from mastctl.answers import Handover, PoseTold, TrackStands, TrackState
 from mastctl.as_json import as_json
 from mastctl.control.machine import StateMachine
 from mastctl.control.operations import Operation, OperationRunner
@@ -40,21 +40,23 @@ STANDS_M, STANDS_RAD = 0.005, 0.001
 HELD_UP_S = 60.0
 """No pose is longer on its way. One that seems so was stamped by a clock that was set, or by another one."""
 
+ACTIVE: frozenset[TrackState] = frozenset({"starting", "tracking", "lost"})
+FIRST_POSE = (
+    "the rover's first pose came while the track ran: how far the rover moved since the track began is not "
+    "known; begin the track again"
+)
+
+Outcome = tuple[Track, TrackSighting]
+
 
 @dataclass(frozen=True, eq=False)
 class RoverPose:
     """One pose of the rover.
 
-    Attributes
-    ----------
-    covariance
-        (6, 6) of the motion since the pose before: small rotation, rad², then translation, m², both along
-        the rover's axes of this pose; None if it was not stated. `calib.matching.track.moved_track` has it
-        so.
-    time_s
-        By the sender's clock, which need not be the daemon's; None if it was not stated.
-    received_s
-        When it came, seconds of CLOCK_MONOTONIC.
+    ``covariance`` is (6, 6) of the motion since the pose before: small rotation, rad², then translation, m²,
+    both along the rover's axes of this pose, as `calib.matching.track.moved_track` has it. ``time_s`` is by
+    the sender's clock, which need not be the daemon's. Both are None where not stated. ``received_s`` is when
+    it came, seconds of CLOCK_MONOTONIC.
     """
 
     site_from_rover: Rigid
@@ -90,16 +92,11 @@ def check_follows(pose: RoverPose, before: RoverPose | None) -> None:
             f"time_s is missing. The pose before had one ({before.time_s:g} s), and without it the "
             f"daemon cannot know which is later; {HELD_UP_S:g} s after that pose it may be left out",
         )
-    if clock_was_set(pose, before) and before.time_s - pose.time_s + passed_s <= HELD_UP_S:
+    if _clock_was_set(pose, before) and before.time_s - pose.time_s + passed_s <= HELD_UP_S:
         raise NotNow(
             "pose_runs_backwards",
             f"time_s is {pose.time_s:g} s, which is not later than the pose before it ({before.time_s:g} s)",
         )
-
-
-def clock_was_set(pose: RoverPose, before: RoverPose) -> bool:
-    """Return whether a pose that follows another is not later than it by their times."""
-    return pose.time_s is not None and before.time_s is not None and pose.time_s <= before.time_s
 
 
 def motion_between(before: RoverPose, now: RoverPose) -> Rigid:
@@ -113,63 +110,9 @@ def stands(motion: Rigid) -> bool:
     return float(np.linalg.norm(motion.translation_m)) <= STANDS_M and turned_rad <= STANDS_RAD
 
 
-@dataclass(frozen=True, eq=False)
-class Carried:
-    """A track between two looks. Immutable.
-
-    Attributes
-    ----------
-    track
-        In the rover frame of ``stands_at``.
-    stands_at
-        None as long as no pose is known.
-    owed
-        Covariance (6, 6) of the motions since then, and the pose up to which they go; None without any.
-    """
-
-    track: Track
-    stands_at: RoverPose | None
-    owed: tuple[FloatArray, RoverPose] | None = None
-
-    @property
-    def jumped(self) -> bool:
-        """Whether poses came since that the track was not carried to."""
-        return self.owed is not None
-
-    def to(self, pose: RoverPose, origin_m: FloatArray, most_step: float) -> tuple[Carried, str]:
-        """Return the track carried to a pose, or left where it is if the pose jumped, with the reason.
-
-        A pose that jumped is not forgotten: what its motion was uncertain by is part of the next one.
-        ``origin_m`` is (3,), from where the target's range counts, rover frame; ``most_step`` the longest
-        way, as a part of that range.
-        """
-        stood, covariance = self.stands_at, pose.covariance
-        assert stood is not None and covariance is not None
-        if self.owed is not None:
-            before, at = self.owed
-            covariance = covariance + carried_covariance(before, motion_between(at, pose))
-        motion = motion_between(stood, pose)
-        range_m = float(np.linalg.norm(self.track.position_m - origin_m))
-        way_m = float(np.linalg.norm(motion.translation_m))
-        if way_m > most_step * range_m:
-            # Whatever is found after this must be confirmed by both cameras.
-            return replace(self, track=replace(self.track, state="lost"), owed=(covariance, pose)), (
-                f"the pose jumped by {way_m:.2f} m with the target {range_m:.2f} m away; a track is carried "
-                f"over at most {most_step:g} of the range at a time"
-            )
-        return Carried(moved_track(self.track, motion, covariance), pose), ""
-
-
-ACTIVE: frozenset[TrackState] = frozenset({"starting", "tracking", "lost"})
-
-
-@dataclass(frozen=True)
-class HandedOver:
-    """The target went from one pair to another, at a range of the new one."""
-
-    from_pair: str
-    to_pair: str
-    range_m: float
+def _clock_was_set(pose: RoverPose, before: RoverPose) -> bool:
+    """Whether a pose that follows another is not later than it by their times."""
+    return pose.time_s is not None and before.time_s is not None and pose.time_s <= before.time_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,20 +129,21 @@ class TrackStatus:
         The operation that started the track.
     predicted
         Whether the rover moved since the last look: the position is carried over, not seen.
-    position_m, covariance_m2
-        (3,) and (3, 3) in the rover frame of ``stands_at``; no covariance is known after a pose that jumped.
+    track
+        What is followed, or was, in the rover frame of ``stands_at``; None before the first images.
     stands_at
         The pose that the track was carried to; None before the first pose.
+    owed
+        Covariance (6, 6) of the motions since then, and the pose up to which they go, if poses came that the
+        track was not carried to; else None.
     pose
         The newest pose. It is another than ``stands_at`` after a pose that jumped, and while a look runs.
     seen
         What the last look saw.
     found_by
         The pair that found the target last.
-    looks, misses
-        Looks so far, and how many in a row did not find it.
-    handoffs, renewals
-        Changes of the pair; how often the key picture was renewed.
+    renewals
+        How often the key picture was renewed.
     operation
         The running start or look.
     changed_s
@@ -211,18 +155,54 @@ class TrackStatus:
     reason: str = ""
     id: str | None = None
     predicted: bool = False
-    position_m: FloatArray | None = None
-    covariance_m2: FloatArray | None = None
+    track: Track | None = None
     stands_at: RoverPose | None = None
+    owed: tuple[FloatArray, RoverPose] | None = None
     pose: RoverPose | None = None
     seen: TrackSighting | None = None
     found_by: str = ""
     looks: int = 0
-    misses: int = 0
-    handoffs: tuple[HandedOver, ...] = ()
+    handoffs: tuple[Handover, ...] = ()
     renewals: int = 0
     operation: str | None = None
     changed_s: float = 0.0
+
+    @property
+    def position_m(self) -> FloatArray | None:
+        """(3,) in the rover frame of ``stands_at``."""
+        return None if self.track is None else self.track.position_m
+
+    @property
+    def covariance_m2(self) -> FloatArray | None:
+        """(3, 3) of the position; None after a pose that jumped."""
+        return None if self.track is None or self.owed is not None else self.track.target_covariance_m2
+
+    def carried_to(self, pose: RoverPose, origin_m: FloatArray, most_step: float) -> TrackStatus:
+        """Return it carried to a pose; lost, and left where it is, if the pose jumped.
+
+        A pose that jumped is not forgotten: what its motion was uncertain by is part of the next one.
+        ``origin_m`` is (3,), from where the target's range counts, rover frame; ``most_step`` the longest
+        way, as a part of that range.
+        """
+        track, stood, covariance = self.track, self.stands_at, pose.covariance
+        assert track is not None and stood is not None and covariance is not None
+        if self.owed is not None:
+            before, at = self.owed
+            covariance = covariance + carried_covariance(before, motion_between(at, pose))
+        motion = motion_between(stood, pose)
+        range_m = float(np.linalg.norm(track.position_m - origin_m))
+        way_m = float(np.linalg.norm(motion.translation_m))
+        if way_m > most_step * range_m:
+            reason = (
+                f"the pose jumped by {way_m:.2f} m with the target {range_m:.2f} m away; a track is carried "
+                f"over at most {most_step:g} of the range at a time"
+            )
+            # Whatever is found after this must be confirmed by both cameras.
+            track = replace(track, state="lost")
+            return replace(self, state="lost", reason=reason, track=track, owed=(covariance, pose))
+        reason = self.reason if self.owed is None else "not looked for since a pose jumped"
+        moved = moved_track(track, motion, covariance)
+        return replace(self, reason=reason, track=moved, stands_at=pose, owed=None)
 
     def as_json(self, now_s: float) -> TrackStands:
         """Return it as ``GET /track`` has it."""
@@ -243,8 +223,8 @@ class TrackStatus:
             "predicted": self.predicted,
             "operation": self.operation,
             "looks": self.looks,
-            "misses": self.misses,
-            "handoffs": as_json(self.handoffs),
+            "misses": 0 if self.track is None else self.track.misses,
+            "handoffs": list(self.handoffs),
             "renewals": self.renewals,
             "range_m": None if seen is None else as_json(seen.range_m),
             "pair": None if seen is None else seen.pair,
@@ -258,14 +238,6 @@ class TrackStatus:
             "pose": None if self.pose is None else self.pose.as_json(now_s),
             "age_s": max(0.0, now_s - self.changed_s),
         }
-
-
-FIRST_POSE = (
-    "the rover's first pose came while the track ran: how far the rover moved since the track began is not "
-    "known; begin the track again"
-)
-
-Outcome = tuple[Track, TrackSighting]
 
 
 class Tracker:
@@ -300,7 +272,6 @@ class Tracker:
         self._on_matched = on_matched
         self._lock = threading.Lock()
         self._status = TrackStatus()
-        self._carried: Carried | None = None  # what is followed; None without a track
         self._waiting: list[RoverPose] = []  # poses that came while a look runs
         self._look_again = False
         self._left = False  # whether the rover left, by a refused pose, where what runs takes its images
@@ -331,7 +302,7 @@ class Tracker:
 
             operation = self._run(recorded, begin)
             pose = self._status.pose
-            self._carried, self._waiting, self._look_again = None, [], False
+            self._waiting, self._look_again = [], False
             self._publish(
                 TrackStatus(
                     state="starting", id=operation.id, stands_at=pose, pose=pose, operation=operation.id
@@ -344,18 +315,12 @@ class Tracker:
     ) -> str | None:
         """Carry the track over to the rover's present pose and ``look`` for its target.
 
-        The first pose ends a track that began without one.
+        The first pose ends a track that began without one. ``on_taken`` gets a pose that is not refused,
+        before anything is looked for from it; it must return at once.
 
-        ``on_taken``: gets a pose that is not refused, before anything is looked for from it; must return at
-        once.
-
-        Returns
-        -------
-        operation
-            The id of the look; None if there is no track, none is wanted, or none could be started.
-
-        Raises BadRequest, NotNow if it is not later than the one before, or, while a track runs, if it has no
-        covariance: then the track is lost if the rover moved.
+        Returns the id of the look; None if there is no track, none is wanted, or none could be started.
+        Raises BadRequest, NotNow if the pose is not later than the one before, or, while a track runs, if it
+        has no covariance: then the track is lost if the rover moved.
         """
         with self._lock:
             before = self._status.pose
@@ -368,7 +333,7 @@ class Tracker:
                     "covariance (6 rows of 6) or sigma of the motion since the pose before is missing; while "
                     "a track runs it says where to look",
                 )
-            if before is not None and clock_was_set(pose, before):
+            if before is not None and _clock_was_set(pose, before):
                 message = "the clock of the rover's poses was set, or is another: %g s after %g s"
                 log.info(message, pose.time_s, before.time_s)
             on_taken(pose)
@@ -398,13 +363,13 @@ class Tracker:
         operation runs.
         """
         with self._lock:
-            carried = self._carried
-            if carried is None:
+            status = self._status
+            if status.state not in ACTIVE or status.track is None:
                 raise NotNow("no_track", "no track runs that could be looked for")
-            if carried.jumped:
-                raise NotNow("no_track", self._status.reason)
-            operation = self._begin_look(carried)
-            self._publish(replace(self._status, operation=operation.id))
+            if status.owed is not None:
+                raise NotNow("no_track", status.reason)
+            operation = self._begin_look(status.track)
+            self._publish(replace(status, operation=operation.id))
             return operation
 
     def stop(self, reason: str) -> str | None:
@@ -431,7 +396,7 @@ class Tracker:
 
     def _end(self, status: TrackStatus, reason: str) -> None:
         """Follow nothing any more."""
-        self._carried, self._waiting, self._look_again = None, [], False
+        self._waiting, self._look_again = [], False
         self._publish(replace(status, state="stopped", reason=reason, operation=None))
         log.info("track %s stopped: %s", status.id, reason)
 
@@ -440,13 +405,14 @@ class Tracker:
         if stands(motion):
             return
         self._left = True
-        if self._carried is None:  # its start ends by that
+        track = self._status.track
+        if track is None:  # its start ends by that
             return
-        # Whatever is found after this must be confirmed by both cameras.
-        self._carried = replace(self._carried, track=replace(self._carried.track, state="lost"))
         way_m = float(np.linalg.norm(motion.translation_m))
         reason = f"the rover moved by {way_m:.2f} m, and its pose was refused: it had no covariance"
-        self._publish(replace(self._status, state="lost", predicted=True, reason=reason))
+        # Whatever is found after this must be confirmed by both cameras.
+        track = replace(track, state="lost")
+        self._publish(replace(self._status, state="lost", predicted=True, reason=reason, track=track))
 
     def _run(self, recorded: Mapping[str, Any], work: Callable[[TargetSearch], Outcome]) -> Operation:
         """Start an operation that looks; its outcome comes to `_ended`."""
@@ -465,36 +431,24 @@ class Tracker:
             recorded, run, lambda operation: self._ended(operation, outcomes[0] if outcomes else None)
         )
 
-    def _begin_look(self, carried: Carried) -> Operation:
+    def _begin_look(self, track: Track) -> Operation:
         """Start a look. Raises NotNow, Unable."""
         found_by = self._status.found_by
-        operation = self._run({"track": self._status.id}, lambda search: search.find(carried.track, found_by))
+        operation = self._run({"track": self._status.id}, lambda search: search.find(track, found_by))
         self._look_again = False
         return operation
 
     def _looked_for(self, status: TrackStatus) -> TrackStatus:
         """Begin a look unless that makes no sense now; the status says why not."""
-        if self._carried is None or self._carried.jumped:
+        if status.track is None or status.owed is not None:
             return status
         try:
-            return replace(status, operation=self._begin_look(self._carried).id)
+            return replace(status, operation=self._begin_look(status.track).id)
         except MastctlError as error:  # a pointing runs, or the service is closing
             return replace(status, reason=f"not looked for yet: {error}")
 
     def _carry(self, status: TrackStatus, pose: RoverPose) -> TrackStatus:
-        """Carry the track over to a pose; it is lost if the pose jumped."""
-        assert self._carried is not None
-        after_jump = self._carried.jumped
-        origin_m = self._rig.mast.translation_m
-        self._carried, reason = self._carried.to(pose, origin_m, self._settings.most_step)
-        if reason:
-            return replace(status, state="lost", reason=reason, covariance_m2=None)
-        if after_jump:
-            status = replace(status, reason="not looked for since a pose jumped")
-        track = self._carried.track
-        return replace(
-            status, position_m=track.position_m, covariance_m2=track.target_covariance_m2, stands_at=pose
-        )
+        return status.carried_to(pose, self._rig.mast.translation_m, self._settings.most_step)
 
     def _started(
         self, status: TrackStatus, operation: Operation, outcome: Outcome | None, left: bool
@@ -508,47 +462,34 @@ class Tracker:
             return replace(ended, state="stopped") if operation.state == "stopped" else ended
         track, seen = outcome
         log.info("track %s begins %.2f m away, by %s", status.id, seen.range_m, seen.pair)
-        self._carried = Carried(track, status.stands_at)
-        return replace(
-            status,
-            state="tracking",
-            position_m=seen.position_m,
-            covariance_m2=seen.covariance_m2,
-            seen=seen,
-            found_by=seen.pair,
-        )
+        return replace(status, state="tracking", track=track, seen=seen, found_by=seen.pair)
 
-    def _looked(
-        self, status: TrackStatus, carried: Carried, operation: Operation, outcome: Outcome | None
-    ) -> TrackStatus:
+    def _looked(self, status: TrackStatus, operation: Operation, outcome: Outcome | None) -> TrackStatus:
         """Take what a look saw from the pose that the track was carried to."""
+        before = status.track
+        assert before is not None
         status = replace(status, looks=status.looks + 1)
         if outcome is None and operation.state == "stopped":
-            self._carried = None
             return replace(status, state="stopped", reason=_why(operation))
         if outcome is None:
             # Nothing was seen: both cameras must find the target again, as after a look without success.
-            track = replace(carried.track, state="lost", misses=carried.track.misses + 1)
-            self._carried = replace(carried, track=track)
-            return replace(status, state="lost", reason=_why(operation), misses=track.misses)
+            track = replace(before, state="lost", misses=before.misses + 1)
+            return replace(status, state="lost", reason=_why(operation), track=track)
         track, seen = outcome
-        self._carried = replace(carried, track=track)
         if seen.pose_doubt and seen.state == "tracked":  # what is lost is logged with its whole reason
             log.warning("track %s: %s", status.id, seen.pose_doubt)
         status = replace(
             status,
             reason="; ".join(filter(None, (seen.reason, seen.pose_doubt))),
-            position_m=seen.position_m,
-            covariance_m2=seen.covariance_m2,
+            track=track,
             seen=seen,
-            misses=track.misses,
             renewals=status.renewals + seen.renewed,
         )
         if seen.state == "lost":
             return replace(status, state="lost")
         if seen.pair != status.found_by:
             log.info("track %s: %s hands over to %s", status.id, status.found_by, seen.pair)
-            handed = HandedOver(status.found_by, seen.pair, seen.range_m)
+            handed = Handover(from_pair=status.found_by, to_pair=seen.pair, range_m=seen.range_m)
             status = replace(status, handoffs=(*status.handoffs, handed))
         return replace(status, state="tracking", predicted=False, found_by=seen.pair)
 
@@ -596,9 +537,8 @@ class Tracker:
                 reason = "the rover moved while the pictures were taken, so that they belong to no one pose"
                 status = replace(status, reason=reason)
             else:
-                assert self._carried is not None
-                status = self._looked(status, self._carried, operation, outcome)
-            if self._carried is not None:
+                status = self._looked(status, operation, outcome)
+            if status.state in ACTIVE:
                 for one in waiting:
                     status = self._carry(status, one)
                 if self._look_again:
@@ -606,7 +546,7 @@ class Tracker:
             self._publish(status)
 
     def _left_by(self, poses: Sequence[RoverPose]) -> bool:
-        """Whether the rover left its pose by poses that came since; the lock is kept."""
+        """Whether the rover left its pose by poses that came since."""
         stood = self._status.stands_at
         return stood is not None and any(not stands(motion_between(stood, one)) for one in poses)
 

@@ -13,7 +13,7 @@ from fastapi import FastAPI, Request
 
 from mastctl.answers import (
     EstopTold,
-    JogTold,
+    JogAnswer,
     LeaseGranted,
     LeaseTold,
     Operations,
@@ -247,7 +247,7 @@ def add_limits(app: FastAPI) -> None:
     """The jog, and the sun."""
 
     @command(app, "POST /jog", JOG, "A heartbeat: turn the head at a rate, for half a second")
-    def jog(body: JogBeat, here: Here) -> JogTold:
+    def jog(body: JogBeat, here: Here) -> JogAnswer:
         return here.service.jogs.beat(body)
 
     @app.get(f"{PREFIX}/limits/sun", summary="The direction that no head camera looks into")

@@ -111,11 +111,8 @@ def test_any_pixel_of_another_camera_can_be_the_aim() -> None:
     point = world.true_point(frame, *pixel)
     aim = Aim("pancam_right", 200.0, 130.0)
     result, steps = run(world, click(frame, *pixel, aim=aim, pointings=2))
-    eyes = next(step for step in steps if step["name"] == "eyes")
-    assert eyes["detail"]["confirmed_by"] == [
-        "navcam_left",
-        "navcam_right",
-    ]  # pancam_left cannot see it so near
+    by = next(step["detail"]["confirmed_by"] for step in steps if step["name"] == "eyes")
+    assert by == ["navcam_left", "navcam_right"], "pancam_left cannot see it so near"
     last = result["pointings"][-1]
     assert last["camera"] == "pancam_right"
     assert last["residual_px"] is not None
@@ -156,10 +153,9 @@ def test_a_position_is_pointed_at_and_its_missing_residual_is_explained(
     assert pointing["residual_px"] is None
     assert pointing["residual_sigma_px"] is None
     assert "no picture" in pointing["note"]
-    assert np.allclose(
-        world.true_pixel(pointing["frame_id"], np.array([4.0, 0.7, 0.0])), MIDDLE_PX, atol=1e-6
-    )
-    assert np.allclose(pointing["predicted_px"], MIDDLE_PX, atol=1e-6)
+    true_px = world.true_pixel(pointing["frame_id"], np.array([4.0, 0.7, 0.0]))
+    for px in (true_px, pointing["predicted_px"]):
+        assert px == pytest.approx(MIDDLE_PX, abs=1e-6)
     assert [step["name"] for step in steps] == ["rest", "solve", "before", "limits", "move", "settle", "look"]
 
 

@@ -78,20 +78,14 @@ def test_a_start_and_a_look_put_the_target_where_it_is() -> None:
     after, seen = search(world, steps).find(track)
     assert (seen.state, seen.pair, seen.reason) == ("tracked", "navcam", "")
     assert np.linalg.norm(after.position_m - point) < 0.03
-    assert [step["name"] for step in steps] == [
-        "choose",
-        "before",
-        "limits",
-        "move",
-        "settle",
-        "look",
-        "find",
-    ]
-    pixels = [np.array([seen.pixels[eye].x_px, seen.pixels[eye].y_px]) for eye in rig().stereo["navcam"]]
+    names = ["choose", "before", "limits", "move", "settle", "look", "find"]
+    assert [step["name"] for step in steps] == names
+    found = [seen.pixels[camera] for camera in rig().stereo["navcam"]]
+    pixels = [np.array([one["x_px"], one["y_px"]]) for one in found]
     middle = (np.array(SIZE_PX) - 1) / 2
     assert np.mean(pixels, axis=0) == pytest.approx(middle, abs=2.0), "pointed before the picture was taken"
-    for eye, pixel in zip(rig().stereo["navcam"], pixels, strict=True):
-        assert pixel == pytest.approx(world.true_pixel(seen.pixels[eye].frame_id, point), abs=0.3)
+    for one, pixel in zip(found, pixels, strict=True):
+        assert pixel == pytest.approx(world.true_pixel(one["frame_id"], point), abs=0.3)
 
 
 def plain(camera: str, number: int, image: np.ndarray) -> np.ndarray:
@@ -136,8 +130,9 @@ def test_one_camera_keeps_a_target_but_does_not_find_a_lost_one() -> None:
     world.silent = ("navcam_right", "pancam_left", "pancam_right")
     after, seen = search(world).find(track)
     assert seen.state == "tracked"
-    assert (seen.pixels["navcam_right"].verdict, seen.pixels["navcam_left"].verdict) == ("no_frame", "good")
-    assert seen.pixels["navcam_right"].reason == "navcam_right: unplugged"
+    right, left = (seen.pixels[f"navcam_{side}"] for side in ("right", "left"))
+    assert (right["verdict"], left["verdict"]) == ("no_frame", "good")
+    assert right["reason"] == "navcam_right: unplugged"
     assert np.linalg.norm(after.position_m - point) < 0.03
     world.image = covered("navcam_left")
     lost, seen = search(world).find(after)
@@ -187,9 +182,9 @@ def test_pictures_that_did_not_move_with_the_head_are_not_looked_at(
     assert (after.state, seen.state) == ("lost", "lost")
     assert after.position_m == pytest.approx(track.position_m)
     for eye in rig().stereo["navcam"]:
-        assert seen.pixels[eye].verdict == "no_frame"
+        assert seen.pixels[eye]["verdict"] == "no_frame"
         why = "unplugged" if eye in silent else "joints and pictures contradict each other"
-        assert why in seen.pixels[eye].reason
+        assert why in seen.pixels[eye]["reason"]
 
 
 def test_a_change_of_the_pair_looks_with_both_and_keeps_what_they_saw() -> None:

@@ -26,11 +26,12 @@ from hil_tests.mastctl.service_fakes import (
     rig,
 )
 from hil_tests.waiting import NET_S, until
+from mastctl.answers import CameraPixel
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.motion import track as track_module
-from mastctl.motion.search import CameraPixel, TrackSighting
+from mastctl.motion.search import TrackSighting
 from mastctl.motion.settings import PointingSettings
 from mastctl.motion.steps import Steps
 
@@ -72,10 +73,11 @@ class ScriptedSearch(Steps):
 
 def seen(track: Track, pair: str = "navcam", reason: str = "") -> TrackSighting:
     """A look that leaves the track where it is."""
-    pixel = CameraPixel("navcam_left-000001-x", "good", "", 31.5, 20.0, (0.1, 0.1), 0.95)
-    return TrackSighting(
-        track.state, reason, pair, track.position_m, track.covariance_m2, 5.0, {"navcam_left": pixel}, 1.0
-    )
+    pixel = CameraPixel(
+        frame_id="navcam_left-000001-x", verdict="good", reason="", x_px=31.5, y_px=20.0, sigma_px=[0.1, 0.1],
+        correlation=0.95,
+    )  # fmt: skip
+    return TrackSighting(track.state, reason, pair, track.position_m, 5.0, {"navcam_left": pixel}, 1.0)
 
 
 def found(track: Track) -> tuple[Track, TrackSighting]:
