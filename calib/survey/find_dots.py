@@ -22,8 +22,7 @@ from calib.geometry.rigid import FloatArray, Rigid, rot_y, rot_z
 from calib.survey.alignment import NotAligned, rover_from_station, station_from_board
 from calib.survey.records import Survey, SurveyCamera, SurveyImage
 from calib.targets.boards import Board, CornersNotFound, Dots
-from calib.targets.dot_order import PredictedBoard, Upright
-from calib.targets.dots import find_dots
+from calib.targets.dots import PredictedBoard, Upright, find_dots
 
 AHEAD = np.array([1.0, 0.0, 0.0])
 DOWN = np.array([0.0, 0.0, 1.0])

@@ -215,7 +215,7 @@ def read_survey(folder: str | Path) -> Survey:
         record = parse_record(StationRecord, data, file, SCHEMA)
         prisms, grid = _frozen(record.prisms_in_rover_m), record.board
         tapes = _frozen(grid.tapes_in_board_m)
-        board = Board(grid.rows, grid.columns, grid.spacing_m, grid.dot_diameter_m, tapes)
+        board = Board(grid.columns, grid.rows, grid.spacing_m, grid.dot_diameter_m, tapes)
     cameras = {name: camera.camera(name, file) for name, camera in record.cameras.items()}
     sigma = Sigma(**record.sigma.model_dump())
     station = () if bench else _station(read, board, prisms)

@@ -28,6 +28,7 @@ from calib.survey.reader import (
     SCHEMA,
     SIGMA_COLUMN,
     STATION_COLUMNS,
+    DotGridRecord,
     read_survey,
 )
 from calib.survey.records import Sigma, Survey, SurveyCamera, SurveyImage
@@ -221,7 +222,7 @@ def _document(survey: Survey) -> dict[str, Any]:
         document["boards"] = {name: document_of(one) for name, one in survey.boards.items()}
         document["sigma"] = {"corner_px": sigma.corner_px, "joint_rad": sigma.joint_rad}
     else:
-        document["board"] = dict(vars(board))
+        document["board"] = {name: getattr(board, name) for name in DotGridRecord.model_fields}
         document["prisms_in_rover_m"] = survey.prisms_in_rover_m
         document["sigma"] = {key: value for key, value in vars(sigma).items() if key != "corner_px"}
     document["cameras"] = {name: _camera_document(camera) for name, camera in survey.cameras.items()}

@@ -5,13 +5,10 @@ the board. Sizes are those of the print in hand, after a measured bar (`calib.ta
 
 A board bends. ``bow_m`` = (across, down) is how far its middle stands out towards the viewer: against its
 left and right edges, and against its upper and lower ones. mrcal calls it calobject_warp.
-
-The dot board of a survey has a frame like it: origin at the grid's centre, x along a row, y down a column.
 """
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -166,7 +163,7 @@ class AprilGrid(_Grid):
 
 @dataclass(frozen=True)
 class DotBoard(_Grid):
-    """Dots in rows and columns, as of a survey with a station; dot = row * columns + column."""
+    """Dots in rows and columns; dot = row * columns + column."""
 
     spacing_m: float
     dot_diameter_m: float
@@ -184,6 +181,19 @@ class DotBoard(_Grid):
     def lines_m(self) -> tuple[FloatArray, FloatArray]:
         """Where the dots' columns and rows are."""
         return _even(self.columns, self.spacing_m), _even(self.rows, self.spacing_m * self.aspect)
+
+    def dots_in_board_m(self, rows: ArrayLike, columns: ArrayLike) -> FloatArray:
+        """Return the centres (n, 3), metres, of dots (rows (n,), columns (n,)), counted from 0."""
+        across, down = self.lines_m
+        x, y = across[np.asarray(columns)], down[np.asarray(rows)]
+        return np.stack([x, y, np.zeros_like(x)], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Board(DotBoard):
+    """The dot board of a survey; ``tapes_in_board_m`` maps the name of a tape to its place (3,), metres."""
+
+    tapes_in_board_m: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
 AnyBoard = Charuco | AprilGrid | DotBoard | Checkerboard
@@ -228,28 +238,7 @@ class CornersNotFound(NamedTuple):
     reason: str
 
 
-@dataclass(frozen=True, eq=False)
-class Board:
-    """The dot board of a survey; its frame has the origin at the grid's centre, x along a row, y down a
-    column.
-
-    ``tapes_in_board_m`` maps the name of a tape to its place (3,), metres.
-    """
-
-    rows: int
-    columns: int
-    spacing_m: float
-    dot_diameter_m: float
-    tapes_in_board_m: Mapping[str, FloatArray]
-
-    def dots_in_board_m(self, rows: ArrayLike, columns: ArrayLike) -> FloatArray:
-        """Return the centres (n, 3), metres, of dots (rows (n,), columns (n,)), counted from 0."""
-        x = (np.asarray(columns, dtype=np.float64) - (self.columns - 1) / 2) * self.spacing_m
-        y = (np.asarray(rows, dtype=np.float64) - (self.rows - 1) / 2) * self.spacing_m
-        return np.stack([x, y, np.zeros_like(x)], axis=-1)
-
-
-NO_BOARD = Board(0, 0, 0.0, 0.0, {})
+NO_BOARD = Board(0, 0, 0.0, 0.0)
 """The surveyed board of a bench: none."""
 
 
@@ -258,15 +247,13 @@ class Dots:
     """Dots found in one image.
 
     ``rows`` and ``columns`` (n,) from 0; ``pixels_px`` (n, 2) the images of the dots' centres; ``sigma_px``
-    (n,) one standard deviation, each axis, None where it was not measured; ``residual_px`` the rms distance
-    per axis to a smooth map of the board, not-a-number where none was fitted.
+    (n,) one standard deviation, each axis, None where it was not measured.
     """
 
     rows: IntArray
     columns: IntArray
     pixels_px: FloatArray
     sigma_px: FloatArray | None = None
-    residual_px: float = math.nan
 
     def __len__(self) -> int:
         return len(self.rows)

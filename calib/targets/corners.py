@@ -19,7 +19,6 @@ from calib.targets.board_file import FAMILIES
 from calib.targets.boards import (
     AnyBoard,
     AprilGrid,
-    Board,
     Charuco,
     Checkerboard,
     Corners,
@@ -87,36 +86,20 @@ def why_not_this_board(board: MarkerBoard, markers: Markers, placed: PlacedMarke
     if isinstance(board, Charuco):
         flipped = placed_markers(markers, replace(board, legacy=not board.legacy))
         if flipped is not None and len(flipped.ids) > placed_count:
-            today, before = (
-                "as OpenCV draws it today (legacy: false)",
-                "as OpenCV before 4.6 draws it (legacy: true)",
-            )
-            drawn = today if board.legacy else before
+            drawn = "as OpenCV before 4.6 draws it (legacy: true)"
+            if board.legacy:
+                drawn = "as OpenCV draws it today (legacy: false)"
             return f"the markers in view stand as on another board: {drawn}; BOARD.yaml says otherwise"
     if mine and placed_count >= MOST_ELSEWHERE * mine:
         return ""
-    if isinstance(board, AprilGrid) and _turned_tags(board, markers) > max(0.8 * found, placed_count):
-        return (
-            "each tag is half a turn off Kalibr's, as OpenCV's dictionary draws it; "
-            "print the board of 'mastctl board make --kind aprilgrid'"
-        )
-    for other, what in _relatives(board):
-        others = placed_markers(markers, other)
-        if others is not None and len(others.ids) > max(0.8 * found, placed_count):
-            return f"the markers in view stand as on another board: {what}, where {_drawn(board)} is expected"
     if len(outside) > MOST_ELSEWHERE * found:
         wanted = f"{board.first_id} to {last} are expected"
         return f"another board is in view: its markers are {_some(outside)}, where {wanted}"
-    return f"another board is in view: its {found} markers do not stand as on one of {_drawn(board)}"
-
-
-def _turned_tags(board: AprilGrid, markers: Markers) -> int:
-    """How many tags stand as on the board, each turned by half a turn; counted from below or from the top."""
-    turned = Markers(markers.ids, np.roll(markers.corners_px, 2, axis=1))
-    row, column = np.divmod(markers.ids - board.first_id, board.columns)
-    from_top = (board.rows - 1 - row) * board.columns + column + board.first_id
-    both = (placed_markers(one, board) for one in (turned, Markers(from_top, turned.corners_px)))
-    return max(0 if one is None else len(one.ids) for one in both)
+    cells = f"{board.columns} x {board.rows} {'tags' if isinstance(board, AprilGrid) else 'squares'}"
+    return (
+        f"another board is in view: its {found} markers do not stand as on one of {cells}; correct "
+        "BOARD.yaml, or print its board with 'mastctl board make'"
+    )
 
 
 def why_nothing(board: AnyBoard, image: Grey8) -> str:
@@ -175,21 +158,6 @@ def _others(board: MarkerBoard, image: Grey8) -> str:
             other = f"{dictionary} with a border of {width}" if "APRIL" in dictionary else dictionary
             return f"another board is in view: its markers are of {other}, not of {mine}"
     return ""
-
-
-def _relatives(board: MarkerBoard) -> list[tuple[MarkerBoard, str]]:
-    """Boards that are easily taken for this one, and how they differ."""
-    return [
-        (replace(board, columns=columns, rows=rows), f"{columns} columns")
-        for columns in range(3 if isinstance(board, Charuco) else 2, 31)
-        for rows in [max(3, 2 * count_of(board) // columns + 2)]
-        if columns != board.columns
-    ]
-
-
-def _drawn(board: MarkerBoard) -> str:
-    what = "tags" if isinstance(board, AprilGrid) else "squares"
-    return f"{board.columns} x {board.rows} {what}"
 
 
 def _some(numbers: list[int]) -> str:
@@ -358,7 +326,7 @@ def _agreeing(board: AnyBoard, found: _Found) -> Corners | CornersNotFound:
 
 def _dots(board: DotBoard, levels: Levels) -> Corners | CornersNotFound:
     """The dots, rows to the right in the image."""
-    found = find_dots(levels, Board(board.rows, board.columns, board.spacing_m, board.dot_diameter_m, {}))
+    found = find_dots(levels, board)
     if isinstance(found, CornersNotFound):
         return found
     assert found.sigma_px is not None

@@ -29,7 +29,7 @@ from calib.matching.warp import Plane, PosedImage, facing_plane
 from calib.survey.alignment import NotAligned, align, mirrored
 from calib.survey.find_dots import find_in_file
 from calib.targets.boards import Dots
-from calib.targets.dot_order import PredictedBoard
+from calib.targets.dots import PredictedBoard
 from hil_tests.calib.adjust.small_surveys import survey_of, with_shifted_dots
 from hil_tests.calib.targets.boards import BOARD, COLUMNS, ROWS, SIZE_PX, camera, gravel, pose
 from hil_tests.support.sim_survey.board import draw_board, photograph

@@ -11,7 +11,7 @@ from calib.geometry.rigid import Rigid
 from calib.targets.boards import Board
 from hil_tests.support.sim_survey.board import BoardLook, draw_board, photograph
 
-BOARD = Board(4, 5, 0.08, 0.04, {})
+BOARD = Board(5, 4, 0.08, 0.04, {})
 LOOK = BoardLook(paper_dn=200.0, dot_dn=40.0, margin_m=0.08)
 FOCAL_PX, SIZE_PX = 800.0, (320, 240)
 CENTRE_PX = np.array([159.5, 119.5])

@@ -43,7 +43,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "board": load_board,
     "camera file": load_any,
     "table": lambda pipe: read_table(pipe, ("x", "y")),
-    "picture of a survey": lambda pipe: find_in_file(pipe, (64, 48), Board(7, 10, 0.02, 0.01, {}), None),
+    "picture of a survey": lambda pipe: find_in_file(pipe, (64, 48), Board(10, 7, 0.02, 0.01, {}), None),
     "recording": lambda pipe: list(read_items(pipe)),
 }
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from calib.files.mast_file import load_rig
 from calib.survey.find_dots import detect_survey, expectations
 from calib.survey.records import Survey
-from calib.targets.dot_order import PredictedBoard, Upright
+from calib.targets.dots import PredictedBoard, Upright
 from hil_tests.calib.targets.boards import gravel
 from hil_tests.support.sim_survey.board import draw_board, photograph
 from hil_tests.support.sim_survey.plan import Ring, SurveyPlan

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from calib.geometry.cahvor import CameraModel, Kind
 from calib.geometry.rigid import Rigid
 from calib.targets.boards import Board
-from calib.targets.dot_order import PredictedBoard
+from calib.targets.dots import PredictedBoard
 from hil_tests.support.sim_survey.board import BoardLook, draw_board, photograph
 
 BOARD = Board(10, 10, 0.08, 0.04, {})
