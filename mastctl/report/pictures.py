@@ -73,12 +73,3 @@ def enlarged(image: Image, center_px: tuple[float, float], half_px: int, scale: 
     side = 2 * half_px * scale + 1
     piece = cv2.warpAffine(in_colour(image), matrix, (side, side), flags=cv2.INTER_LINEAR)
     return np.asarray(piece, dtype=np.uint8)
-
-
-def with_cross(image: Image, x_px: float, y_px: float) -> Image:
-    """Return a copy in colour with a cross that leaves the pixel itself free."""
-    drawn = in_colour(image)
-    x, y = round(x_px), round(y_px)
-    for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-        cv2.line(drawn, (x + 4 * dx, y + 4 * dy), (x + 16 * dx, y + 16 * dy), (0, 255, 255), 1)
-    return drawn

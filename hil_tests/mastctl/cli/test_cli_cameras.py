@@ -1,38 +1,22 @@
-"""camera list, check, grab and focus on a machine without the named camera, and what a PNG carries."""
+"""camera check and focus on a machine without the named camera, and the quality of a picture."""
 
 from __future__ import annotations
-
-import io
 
 import cv2
 import numpy as np
 import pytest
-from PIL import Image as PillowImage
 
 from mastctl.cli.main import main
-from mastctl.report.png_text import with_text
 from mastctl.setup.camera_check import quality_of, sharpness
 
 PICTURE = np.random.default_rng(2).integers(0, 256, (48, 64), dtype=np.uint8)
-PNG = bytes(cv2.imencode(".png", PICTURE)[1])
-WORDS = {"time_utc": "2026-01-02T03:04:05.678+00:00", "pan_rad": "0.1", "name": "mât, 日本"}
-
-
-def test_another_reader_finds_the_words_and_the_picture() -> None:
-    with PillowImage.open(io.BytesIO(with_text(PNG, WORDS))) as opened:
-        opened.load()
-        assert opened.text == WORDS  # type: ignore[attr-defined]
-        assert np.array_equal(np.asarray(opened), PICTURE)
 
 
 def test_the_quality_of_a_picture_is_plain_arithmetic() -> None:
     quality = quality_of(PICTURE)
     assert quality["mean"] == pytest.approx(PICTURE.mean())
-    assert quality["median"] == pytest.approx(np.median(PICTURE), abs=1)
     assert quality["saturated_share"] == pytest.approx((PICTURE >= 250).mean())
     assert quality["dark_share"] == pytest.approx((PICTURE <= 5).mean())
-    counts, _ = np.histogram(PICTURE, bins=16, range=(0, 256))
-    assert quality["histogram"] == pytest.approx(counts / PICTURE.size)
     assert sharpness(PICTURE) > 10 * sharpness(np.asarray(cv2.GaussianBlur(PICTURE, (9, 9), 3)))
 
 

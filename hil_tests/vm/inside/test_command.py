@@ -1,10 +1,8 @@
-"""mastctl camera list, check, grab and focus on vivid's cameras."""
+"""mastctl camera list, check and focus on vivid's cameras."""
 
 from __future__ import annotations
 
-import io
 import json
-from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -14,7 +12,7 @@ from mastctl.cli.main import main
 
 from .conftest import BUS
 
-SETTINGS = ["--size", "640", "480", "--rate", "25", "--set", "timestamp_source=start_of_exposure"]
+SETTINGS = ["--size", "640", "480", "--rate", "25"]
 
 
 def told(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, object]:
@@ -34,17 +32,14 @@ def test_a_check_tells_rate_losses_light_and_what_there_is(capsys: pytest.Captur
     found = told(capsys, "check", BUS[0], "--seconds", "2", *SETTINGS)
     assert found["rate_hz"] == pytest.approx(25.0, rel=0.1)  # by stamps and counts: gaps do not matter
     assert found["damaged"] == 0
-    assert sum(found["quality"]["histogram"]) == pytest.approx(1.0)  # type: ignore[index]
+    assert 0.0 < found["quality"]["mean"] < 255.0  # type: ignore[index]
     assert {"YUYV", "GREY"} <= {f["code"] for f in found["formats"]}  # type: ignore[attr-defined]
     assert "brightness" in {c["name"] for c in found["controls"]}  # type: ignore[attr-defined]
 
 
-def test_a_grabbed_picture_carries_its_time(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_check_writes_the_last_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     file = tmp_path / "grey.png"
-    found = told(capsys, "grab", BUS[0], "--out", str(file), *SETTINGS)
-    with PillowImage.open(io.BytesIO(file.read_bytes())) as opened:
+    told(capsys, "check", BUS[0], "--seconds", "1", "--out", str(file), *SETTINGS)
+    with PillowImage.open(file) as opened:
         opened.load()
-        words = opened.text  # type: ignore[attr-defined]
         assert opened.size == (640, 480) and opened.mode == "L"
-    assert words["bus"] == BUS[0] and words["mid_exposure_s"] == found["mid_exposure_s"]
-    assert datetime.fromisoformat(words["time_utc"]).utcoffset() is not None
