@@ -13,7 +13,7 @@ from calib.geometry.covariance import RigCovariance, moved_rig, stored_covarianc
 from calib.geometry.parameters import parameter_names, parameter_part
 from calib.geometry.rig import JointErrors, Rig
 from calib.geometry.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z, tangents
-from mastctl.setup.new_rig import BadRig
+from mastctl.errors import MastctlError
 
 # LEFT_...: what a survey leaves open, one sigma. Mast: four prisms half a metre apart, 1 mm each. Cameras: so
 # that what they see 5 m away is some 0.1 to 0.3 px off, as with the packaged mast file.
@@ -33,6 +33,13 @@ STATED = (
 
 _SMALL = 1e-6  # of a sigma: steps of the differences that turn these into a camera's own parameters
 GRID = 9
+
+
+class BadRig(MastctlError):
+    """Numbers of which no rig can be made: which one, and what would do."""
+
+    code = "bad_rig"
+    exit_code = 2
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from collections.abc import Iterator
@@ -40,12 +39,10 @@ from mastctl.config import load_config
 from mastctl.packaged import schema_files
 from mastctl.setup import doctor, plugged
 from mastctl.setup import new_folder as folder_module
-from mastctl.setup.drawing import RigAnswers
 from mastctl.setup.machine import ExaminedMachine
 from mastctl.setup.new_folder import README, RULES, write_rig
 from mastctl.setup.plugged import Plugged, head_probes
-from mastctl.setup.questions import Prompts
-from mastctl.setup.rig_folder import CONFIG, MAST
+from mastctl.setup.simulated_rig import CONFIG, MAST, RigNumbers
 
 X = PRESETS["dynamixel_x"]
 HEAD_PROBES = head_probes()
@@ -250,7 +247,7 @@ def test_an_adapter_without_a_stable_name_gets_one_by_a_rule(
     machine = machine_with(tmp_path / "machine", serial)
     folder = tmp_path / "rig"
     head = ServosOnLine(BENCH, "/dev/ttyUSB0", SERVOS)
-    made = write_rig(folder, Plugged((head,), CAMERAS), head, RigAnswers(), machine)
+    made = write_rig(folder, Plugged((head,), CAMERAS), head, RigNumbers(1.0, 0.1, 60.0), machine)
     lines = (folder / RULES).read_text().splitlines()
     line = next(one for one in lines if one.endswith('SYMLINK+="mast"') and not one.startswith("#"))
     known = 'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6014"'
@@ -264,7 +261,7 @@ def test_an_adapter_without_a_stable_name_gets_one_by_a_rule(
 
 def test_a_pair_of_cameras_is_drawn_with_options_of_its_driver(tmp_path: Path) -> None:
     head = ServosOnLine(BENCH, "/dev/serial/by-id/usb-FTDI", SERVOS)
-    answers = RigAnswers(baseline_m=0.16, view_deg=90.0)
+    answers = RigNumbers(1.0, 0.16, 90.0)
     write_rig(tmp_path / "rig", Plugged((head,), CAMERAS), head, answers, ExaminedMachine(tmp_path))
     good_by_schema(tmp_path / "rig")
     config = load_config(tmp_path / "rig" / CONFIG)
@@ -276,16 +273,3 @@ def test_a_pair_of_cameras_is_drawn_with_options_of_its_driver(tmp_path: Path) -
     for name, camera in config.hardware.cameras.items():
         assert parse_options(camera.options, name).size_px == (640, 480)
     assert dynamixel_settings(config.hardware.pan_tilt.options).port == "/dev/serial/by-id/usb-FTDI"
-
-
-def test_answers_are_asked_until_they_fit_and_never_without_a_terminal() -> None:
-    out = io.StringIO()
-    asks = Prompts(io.StringIO("tall\n9\n1.4\nc\nb\n\n"), out, terminal=True)
-    assert asks.number("height, m", 1.0, 0.3, 5.0) == 1.4
-    assert asks.one_of("which", ("a", "b"), "a") == "b"
-    assert asks.one_of("which", ("a", "b"), "a") == "a"
-    assert asks.number("at the end of the input", 2.0, 0.0, 9.0) == 2.0
-    assert out.getvalue().count("a number from 0.3 to 5 is expected") == 2
-    silent = io.StringIO()
-    assert Prompts(io.StringIO("3\n"), silent).number("height, m", 1.0, 0.3, 5.0) == 1.0
-    assert silent.getvalue() == ""

@@ -53,11 +53,11 @@ def test_all_that_is_drawn_comes_from_the_seed(tmp_path: Path) -> None:
 
 
 def test_the_numbers_asked_for_are_those_of_the_rig(tmp_path: Path) -> None:
-    words = "--height 2.2 --baseline 0.4 --size 800x600 --view-deg 50 --name tall --head ph42 --speed max"
+    words = "--height 2.2 --baseline 0.4 --size 800x600 --view-deg 50 --head ph42 --speed max"
     made(tmp_path, *words.split())
     rig = load_rig(tmp_path / "mast.yaml").rig
     left, right = (rig.cameras[f"navcam_{side}"].model for side in ("left", "right"))
-    assert rig.name == "tall" and left.size_px == (800, 600)
+    assert left.size_px == (800, 600)
     assert rig.mast.translation_m == pytest.approx([0.0, 0.0, -2.2], abs=0.01)
     assert np.linalg.norm(right.C - left.C) == pytest.approx(0.4, abs=0.015)
     edges = left.ray([(-0.5, 299.5), (799.5, 299.5)]).directions
@@ -66,17 +66,14 @@ def test_the_numbers_asked_for_are_those_of_the_rig(tmp_path: Path) -> None:
     assert config.hardware.simulation["head"] == "ph42" and config.hardware.simulation["speed"] == "max"
 
 
-def test_a_rig_is_never_overwritten_unless_that_is_asked_for(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_rig_is_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = made(tmp_path, "--seed", "1")
     (tmp_path / "config.yaml").unlink()
     assert main(["rig", "sim", "new", str(tmp_path), "--seed", "2"]) == 2
     told = capsys.readouterr().err
-    assert "mast.yaml exists" in told and "--force" in told
+    assert "mast.yaml exists, and nothing is replaced" in told
     assert (tmp_path / "mast.yaml").read_bytes() == before["mast.yaml"]
     assert not (tmp_path / "config.yaml").exists()
-    assert made(tmp_path, "--seed", "2", "--force") != before
 
 
 def test_a_twin_believes_the_file_and_is_drawn_from_its_covariance(repository: Path, tmp_path: Path) -> None:

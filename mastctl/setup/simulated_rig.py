@@ -1,0 +1,237 @@
+"""A simulated rig from numbers or a mast file: configuration, the mast file that is believed, the truth."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.files.atomic import save_bytes
+from calib.files.mast_file import load_rig, save_rig
+from calib.files.yaml_text import dump_mapping
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Mast, Rig, RigCamera
+from calib.geometry.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
+from drivers.sim.axis import AxisSettings
+from drivers.sim.heads import DEFAULT_HEADS, PRESETS
+from drivers.sim.settings import simulation_settings
+from mastctl.calibration.mast_file import rounded_matrix
+from mastctl.config import CONFIG_SCHEMA, check_cameras, load_config
+from mastctl.errors import MastctlError
+from mastctl.packaged import driver_of_hardware, name_schema
+from mastctl.setup.true_twin import STATED, BadRig, Twin, true_twin, usual_covariance
+
+CONFIG, MAST, TRUE_RIG = "config.yaml", "mast.yaml", "true_rig.yaml"
+NAME = "new_rig"
+
+USUAL_LIMITS_RAD = ((-2.6, 2.6), (-1.2, 0.5))
+MARGIN_RAD = 0.05
+"""Between the soft limits and the ends of the head's range."""
+
+FORWARD_M, DOWN_M = 0.06, 0.03
+"""Of the cameras from the middle of the head, as on the packaged rover."""
+
+# How far a rig is built from its drawing, one sigma: as the packaged rover (configs/sim/rocky8.yaml).
+BUILT_ANGLE_RAD = 4e-3
+BUILT_PLACE_M = 2e-3
+BUILT_FOCAL = 4e-3
+BUILT_ASPECT = 1e-3
+BUILT_MIDDLE = 7e-3  # of the width
+BUILT_LENS_AXIS_RAD = 3e-3
+LENS = ((-0.05, 0.01), (0.012, 0.002))  # R1 and R2: usual, sigma
+
+LEAST_DEG = 15.0
+"""Between the ends of an axis: both keep a margin."""
+
+
+class InTheWay(MastctlError):
+    """Files of a rig are there already."""
+
+    code = "in_the_way"
+    exit_code = 2
+
+
+@dataclass(frozen=True)
+class RigNumbers:
+    """What a rig cannot report itself; its axes meet ``height_m`` over the ground, over the rover's origin.
+
+    ``view_deg`` is the cameras' view across their images; beyond 110 degrees a CAHVOR lens of usual R1 and R2
+    is too far from a real one. ``pan_deg`` and ``tilt_deg`` are the ends of the axes. Raises BadRig with the
+    option that is out of bounds.
+    """
+
+    height_m: float
+    baseline_m: float
+    view_deg: float
+    size_px: tuple[int, int] = (1024, 768)
+    pan_deg: tuple[float, float] = (-85.0, 85.0)
+    tilt_deg: tuple[float, float] = (-40.0, 30.0)
+    pan_id: int = 1
+    tilt_id: int = 2
+
+    def __post_init__(self) -> None:
+        bounds = [
+            ("--height", self.height_m, 0.3, 5.0),
+            ("--baseline", self.baseline_m, 0.02, 1.0),
+            ("--view-deg", self.view_deg, 1.0, 110.0),
+            *(("--size", side, 64, 4096) for side in self.size_px),
+        ]
+        for option, (low, high) in {"--pan-deg": self.pan_deg, "--tilt-deg": self.tilt_deg}.items():
+            bounds += [(option, low, -175.0, 175.0 - LEAST_DEG), (option, high, low + LEAST_DEG, 175.0)]
+        for option, value, least, most in bounds:
+            if not least <= value <= most:
+                raise BadRig(f"{option} is {value:g} where {least:g} to {most:g} is expected")
+
+    def focal_px(self, width_px: int) -> float:
+        """Return the focal length of images of this width, pixels."""
+        return width_px / 2.0 / math.tan(math.radians(self.view_deg) / 2.0)
+
+
+def built_rig(numbers: RigNumbers, rng: np.random.Generator) -> Rig:
+    """Return the rig as a workshop builds it: mast and cameras a little off what the drawing says."""
+    mast = Mast(
+        np.array([0.0, 0.0, -numbers.height_m]) + BUILT_PLACE_M * rng.standard_normal(3),
+        BUILT_ANGLE_RAD * rng.standard_normal(3),
+    )
+    half_m = numbers.baseline_m / 2.0
+    cameras = {
+        f"navcam_{side}": RigCamera("head", _built_camera(numbers, np.array([FORWARD_M, y_m, DOWN_M]), rng))
+        for side, y_m in (("left", -half_m), ("right", half_m))
+    }
+    return Rig(NAME, mast, cameras, {"navcam": ("navcam_left", "navcam_right")})
+
+
+def _built_camera(numbers: RigNumbers, place_m: FloatArray, rng: np.random.Generator) -> CameraModel:
+    """One camera that looks ahead along x of the head."""
+    width, height = numbers.size_px
+    focal_px = numbers.focal_px(width) * (1.0 + BUILT_FOCAL * rng.standard_normal())
+    across_px = focal_px * (1.0 + BUILT_ASPECT * rng.standard_normal())
+    middle_px = np.array([(width - 1) / 2, (height - 1) / 2])
+    middle_px = middle_px + BUILT_MIDDLE * width * rng.standard_normal(2)
+    ahead, right, down = np.eye(3)
+    lens_axis = ahead + np.array([0.0, *(BUILT_LENS_AXIS_RAD * rng.standard_normal(2))])
+    bends = [usual + sigma * rng.standard_normal() for usual, sigma in LENS]
+    model = CameraModel(
+        kind="CAHVOR",
+        size_px=numbers.size_px,
+        C=np.zeros(3),
+        A=ahead,
+        H=across_px * right + middle_px[0] * ahead,
+        V=focal_px * down + middle_px[1] * ahead,
+        O=lens_axis / np.linalg.norm(lens_axis),
+        R=np.array([0.0, *bends]),
+    )
+    x, y, z = BUILT_ANGLE_RAD * rng.standard_normal(3)
+    return model.moved(
+        Rigid(rot_x(x) @ rot_y(y) @ rot_z(z), place_m + BUILT_PLACE_M * rng.standard_normal(3))
+    )
+
+
+def check_free(folder: Path, names: Sequence[str] = (CONFIG, MAST, TRUE_RIG)) -> None:
+    """Refuse a folder in which a file would be replaced. Raises InTheWay with the first."""
+    for path in (folder / name for name in names):
+        if path.exists() or path.is_symlink():  # a link to nowhere too
+            raise InTheWay(f"{path} exists, and nothing is replaced; another folder is expected")
+
+
+def write_built(
+    rig: Rig,
+    folder: Path,
+    simulation: Mapping[str, Any],
+    seed: int,
+    limits_rad: Sequence[Sequence[float]] = USUAL_LIMITS_RAD,
+) -> Twin:
+    """Write a rig made of numbers, believed as a usual calibration leaves it. Raises as `write_twin`.
+
+    ``limits_rad`` are the soft limits of pan and tilt that are wanted, within what the head reaches.
+    """
+    known = usual_covariance(rig)
+    fit = {
+        "method": "stated",
+        "stated": STATED,
+        "parameters": list(known.names),
+        "covariance": rounded_matrix(known.covariance),
+    }
+    source = {"kind": "made by mastctl rig sim new from numbers", "seed": seed}
+    believed = replace(rig, fit=fit, provenance=source)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_rig(believed, folder / MAST)
+    name_schema(folder / MAST, "mast")
+    return _write(believed, folder, simulation, seed, limits_rad)
+
+
+def write_twin(file: Path, folder: Path, simulation: Mapping[str, Any], seed: int) -> Twin:
+    """Write a mast file, to the byte, and a true rig that it could be the calibration of.
+
+    Raises BadFile, BadOptions for ``simulation``, and as `true_twin` if no true rig can be drawn.
+    """
+    believed = load_rig(file)
+    data = file.read_bytes()
+    true_twin(believed.rig, np.random.default_rng(seed))  # before anything is written
+    folder.mkdir(parents=True, exist_ok=True)
+    save_bytes(folder / MAST, data)
+    return _write(believed.rig, folder, simulation, seed)
+
+
+def _write(
+    believed: Rig,
+    folder: Path,
+    simulation: Mapping[str, Any],
+    seed: int,
+    limits_rad: Sequence[Sequence[float]] = USUAL_LIMITS_RAD,
+) -> Twin:
+    """Write the true rig and the configuration, and read all of it as the daemon does."""
+    twin = true_twin(believed, np.random.default_rng(seed))
+    stated = "" if twin.by == "fit.covariance" else f": {STATED}"
+    provenance = {
+        "kind": "the true rig of a simulated rover, which the service never reads",
+        "drawn": f"about {MAST} by {twin.by}{stated}",
+        "seed": seed,
+    }
+    true_rig = replace(twin.true_rig, name=f"{believed.name}_true", fit={}, provenance=provenance)
+    save_rig(true_rig, folder / TRUE_RIG)
+    save_bytes(folder / CONFIG, dump_mapping(_configuration(believed, simulation, limits_rad)))
+    for name, kind in ((TRUE_RIG, "mast"), (CONFIG, "config")):
+        name_schema(folder / name, kind)
+    config = load_config(folder / CONFIG)
+    check_cameras(config, load_rig(config.mast_file).rig)
+    simulation_settings(config.hardware.simulation, config.hardware.folder)
+    return twin
+
+
+def _configuration(
+    rig: Rig, simulation: Mapping[str, Any], limits_rad: Sequence[Sequence[float]]
+) -> dict[str, Any]:
+    """The configuration that runs the rig: every camera simulated, soft limits inside the head's range."""
+    wire = simulation.get("wire")
+    head = PRESETS[simulation.get("head", DEFAULT_HEADS.get(str(wire), "ptu_d46_70"))]
+    pan_rad, tilt_rad = (
+        _limits(axis, usual) for axis, usual in zip((head.pan, head.tilt), limits_rad, strict=True)
+    )
+    simulated = driver_of_hardware("simulated")
+    return {
+        "schema": CONFIG_SCHEMA,
+        "mast_file": MAST,
+        "listen": {"host": "127.0.0.1", "port": 8420},
+        "pan_tilt": {"driver": simulated},
+        "cameras": {name: {"driver": simulated} for name in rig.cameras},
+        "limits": {
+            "pan_rad": pan_rad,
+            "tilt_rad": tilt_rad,
+            "speed_rad_per_s": min(1.0, head.pan.speed_rad_per_s, head.tilt.speed_rad_per_s),
+        },
+        "simulation": {"rover": TRUE_RIG, **simulation},
+    }
+
+
+def _limits(axis: AxisSettings, usual: Sequence[float]) -> list[float]:
+    """Soft limits of an axis."""
+    margin_rad = MARGIN_RAD + axis.approach_rad
+    return [
+        round(max(usual[0], axis.low_rad + margin_rad), 3),
+        round(min(usual[1], axis.high_rad - margin_rad), 3),
+    ]
