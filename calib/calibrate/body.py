@@ -40,7 +40,7 @@ from calib.geometry.rig import Rig, gimbal, gimbal_rates, numbers_of
 from calib.geometry.rigid import FloatArray, Rigid, moved_rigid, rigid_rates, rigid_twists
 from calib.geometry.significance import Level, chance, sigmas
 from calib.geometry.stereo import triangulate
-from calib.matching.handed_over import MODEL_PX, MatchedHandoff
+from calib.matching.handoff import MODEL_PX, MatchedHandoff
 
 PRIOR_SHIFT_M, PRIOR_TURN_RAD = 0.005, 0.005
 """Sigma an axis of how far two prism set-ups disagree: the paper's 5 mrad (2 mm at prisms 40 to 60 cm apart),

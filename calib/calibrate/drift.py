@@ -25,8 +25,7 @@ from calib.geometry.parameters import focus_and_turn_rates, parameter_names
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, rigid_rates
 from calib.geometry.significance import MEDIAN_OF_TWO, chance, sigmas
-from calib.matching.patch import match_patch
-from calib.matching.verdict import MatchSettings
+from calib.matching.patch import MatchSettings, match_patch
 from calib.matching.warp import Grey, PosedImage, facing_plane
 
 ALARM_SIGMAS = 6.0

@@ -4,22 +4,31 @@ The source pair gives the surface around the target (`calib.matching.partner`); 
 over it into each destination camera and correlated inside the ellipse that the geometric hand-off leaves
 (`calib.matching.patch`). What is found there is accepted only if it is the one thing that fits, and if the
 destination's two cameras and the source's range mean the same point.
+
+A record of one hand-off and what came of it (`MatchedHandoff`) has all that is needed to judge it again
+later, with any mast file. Many of these show whether the two sets of cameras mean the same rover frame
+(`calib.calibrate.body`). The constant offset that they leave in each destination camera is the mast's
+self-check in service: nothing is fitted but a mean of what is found less what the source pair predicts. One
+that stands out says that the two cameras do not mean the same rover frame (the paper saw 1.5 and 2 px).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from calib.geometry.handoff import Handoff, PredictedPixel
+from calib.adjust.gross import at_least_stated, chance_limit
+from calib.geometry.handoff import Handoff, Joints, PredictedPixel
 from calib.geometry.rigid import FloatArray
+from calib.geometry.significance import Level, chance, sigmas
 from calib.matching.partner import find_partner
-from calib.matching.patch import match_patch
-from calib.matching.verdict import worst_px2
+from calib.matching.patch import match_patch, worst_px2
 from calib.matching.warp import Plane, PosedImage
 
 RefinedVerdict = Literal["accepted", "ambiguous", "flat", "occluded", "unseen"]
@@ -77,9 +86,9 @@ class RefinedPixel:
 
     verdict: RefinedVerdict
     reason: str
-    pixel_px: FloatArray
-    covariance_px2: FloatArray
-    off_px: FloatArray
+    pixel_px: FloatArray = field(default_factory=lambda: np.full(2, np.nan))
+    covariance_px2: FloatArray = field(default_factory=lambda: np.full((2, 2), np.nan))
+    off_px: FloatArray = field(default_factory=lambda: np.full(2, np.nan))
     correlation: float = 0.0
     second: float = 0.0
 
@@ -103,7 +112,9 @@ def refine_handoff(
     for name, image in destinations.items():
         predicted = handoff.pixels.get(name)
         if predicted is None:
-            refined[name] = _none("unseen", handoff.reasons.get(name, "the hand-off has no such camera"))
+            refined[name] = RefinedPixel(
+                "unseen", handoff.reasons.get(name, "the hand-off has no such camera")
+            )
         elif isinstance(surface, Plane):
             refined[name] = _searched(source[0], clicks[0], surface, image, predicted, settings)
         else:
@@ -112,7 +123,7 @@ def refine_handoff(
     against = _not_confirmed(refined, accepted, handoff, settings) if accepted else ""
     if not against:
         return refined
-    taken_back = _none("occluded", against)
+    taken_back = RefinedPixel("occluded", against)
     return refined | {
         name: replace(taken_back, off_px=one.off_px, correlation=one.correlation, second=one.second)
         for name, one in accepted.items()
@@ -126,11 +137,11 @@ def _surface(
     left, right = source
     found = find_partner(left, clicks_px[0], right)
     if found.match.verdict != "good" or found.plane is None:
-        return _none(_VERDICTS[found.match.verdict], f"in the source pair: {found.match.reason}")
+        return RefinedPixel(_VERDICTS[found.match.verdict], f"in the source pair: {found.match.reason}")
     apart_px = float(np.linalg.norm(found.match.pixel_px - clicks_px[1]))
     worst = settings.click_px + 4.0 * math.sqrt(worst_px2(found.match.covariance_px2))
     if apart_px > worst:
-        return _none(
+        return RefinedPixel(
             "ambiguous",
             f"in the source pair: the right camera's pixel lies {apart_px:.1f} px from where "
             f"the pictures put the left camera's target, at most {worst:.1f} px is expected",
@@ -150,28 +161,32 @@ def _searched(
     search = settings.sigmas * math.sqrt(worst_px2(predicted.search_px2))
     search = min(max(search, settings.least_px), settings.most_px)
     found = match_patch(source, pixel_px, surface, image, search)
-    scores = (found.correlation, found.second)
+
+    def refused(verdict: RefinedVerdict, reason: str) -> RefinedPixel:
+        return RefinedPixel(verdict, reason, correlation=found.correlation, second=found.second)
+
     # Whether the patch fits into the picture wherever in the window the target is.
     if not image.camera.holds(found.predicted_px, search + found.half_px + 0.5):
         edge = f"part of the {search:.0f} px around the hand-off's pixel where it may be lies at the border"
         reason = found.reason if found.verdict == "border" else f"{edge} of the picture"
-        return _none("unseen", reason, *scores)
+        return refused("unseen", reason)
     if found.verdict == "border":
         # All of the window could be searched: what it shows best is not the target.
-        return _none("occluded", found.reason, *scores)
+        return refused("occluded", found.reason)
     if found.verdict != "good":
-        return _none(_VERDICTS[found.verdict], found.reason, *scores)
+        return refused(_VERDICTS[found.verdict], found.reason)
     off = found.pixel_px - predicted.pixel_px
     allowed = predicted.search_px2 + found.covariance_px2 + settings.model_px**2 * np.eye(2)
     distance = math.sqrt(float(off @ np.linalg.solve(allowed, off)))
     if distance > settings.sigmas + 1.0:
-        return _none(
+        return refused(
             "occluded",
             f"the best match lies {np.linalg.norm(off):.1f} px from the geometric hand-off, {distance:.1f} "
             "of its standard deviations: something else, or a wrong calibration",
-            *scores,
         )
-    return RefinedPixel("accepted", "", found.pixel_px, found.covariance_px2, off, *scores)
+    return RefinedPixel(
+        "accepted", "", found.pixel_px, found.covariance_px2, off, found.correlation, found.second
+    )
 
 
 def _not_confirmed(
@@ -202,8 +217,177 @@ def _not_confirmed(
     )
 
 
-def _none(
-    verdict: RefinedVerdict, reason: str, correlation: float = 0.0, second: float = 0.0
-) -> RefinedPixel:
-    nowhere = np.full(2, np.nan)
-    return RefinedPixel(verdict, reason, nowhere, np.full((2, 2), np.nan), nowhere, correlation, second)
+MODEL_PX = RefineSettings().model_px
+"""One sigma, each axis, of what a match is wrong by beyond its own covariance: relief, camera models."""
+
+
+@dataclass(frozen=True, eq=False)
+class Landed:
+    """Where one destination camera was to see the target, and where its picture shows it.
+
+    ``geometric_px`` (2,) with the covariance (2, 2) of the clicks alone; ``found_px`` with its own, None
+    unless the match is ``accepted``.
+    """
+
+    geometric_px: FloatArray
+    geometric_covariance_px2: FloatArray
+    verdict: RefinedVerdict
+    reason: str = ""
+    found_px: FloatArray | None = None
+    found_covariance_px2: FloatArray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedHandoff:
+    """A target handed from a stereo pair to other cameras and looked up in their pictures.
+
+    Attributes
+    ----------
+    time
+        ISO 8601, UTC.
+    mast_digest
+        Of the mast file that was believed.
+    joints, to_joints
+        Joint readings of the source's and of the destination's pictures.
+    clicks_px, sigma_px
+        (2, 2) the target in the pictures of the pair, left one first, and the sigma of each coordinate.
+    landed
+        By destination camera that was to see it.
+    name
+        Where it is stored, for messages; empty if nowhere.
+    """
+
+    time: str
+    mast_digest: str
+    pair: tuple[str, str]
+    joints: Joints
+    clicks_px: FloatArray
+    sigma_px: float
+    to_joints: Joints
+    landed: Mapping[str, Landed]
+    name: str = ""
+
+    @property
+    def found(self) -> dict[str, Landed]:
+        """Those destination cameras whose match was accepted."""
+        return {name: one for name, one in self.landed.items() if one.verdict == "accepted"}
+
+
+def matched_handoff(
+    mast_digest: str,
+    pair: tuple[str, str],
+    joints: Joints,
+    clicks_px: ArrayLike,
+    sigma_px: float,
+    to_joints: Joints,
+    handoff: Handoff,
+    refined: Mapping[str, RefinedPixel],
+    time: datetime | None = None,
+) -> MatchedHandoff:
+    """Return the record of a geometric hand-off, with what it was made of, and its refinement.
+
+    Destination cameras that do not see the target, or were not searched, are left out.
+    """
+    landed = {}
+    for name, predicted in handoff.pixels.items():
+        if predicted is None or name not in refined:
+            continue
+        one = refined[name]
+        good = one.verdict == "accepted"
+        landed[name] = Landed(
+            predicted.pixel_px,
+            predicted.covariance_px2,
+            one.verdict,
+            one.reason,
+            one.pixel_px if good else None,
+            one.covariance_px2 if good else None,
+        )
+    when = (time or datetime.now(UTC)).astimezone(UTC).isoformat(timespec="milliseconds")
+    clicks = np.array(clicks_px, dtype=np.float64)
+    return MatchedHandoff(when, mast_digest, pair, joints, clicks, sigma_px, to_joints, landed)
+
+
+@dataclass(frozen=True, eq=False)
+class HandoffBias:
+    """The mean offset of one camera against the pair that handed over.
+
+    Attributes
+    ----------
+    handoffs, left_out
+        Accepted matches that were averaged, and those too far from the median.
+    offset_px, covariance_px2
+        (2,) found less predicted, weighted mean, and its (2, 2) covariance.
+    chance, sigmas
+        Of such a mean without any offset, and the same in sigmas.
+    """
+
+    source: str
+    camera: str
+    handoffs: int
+    left_out: int
+    offset_px: FloatArray
+    covariance_px2: FloatArray
+    chance: float
+    sigmas: float
+
+    @property
+    def significant(self) -> bool:
+        """Whether chance alone does so less often than three sigma."""
+        return self.chance < Level.THREE_SIGMAS
+
+    @property
+    def sentence(self) -> str:
+        """The offset as a sentence."""
+        sigma = np.sqrt(np.diag(self.covariance_px2))
+        x, y = (
+            f"{abs(off):.2f} +- {s:.2f} px {sides[int(off < 0)]}"
+            for off, s, sides in zip(
+                self.offset_px, sigma, (("right", "left"), ("lower", "higher")), strict=True
+            )
+        )
+        return (
+            f"{self.camera} sees targets {x} and {y} of where {self.source} puts them "
+            f"({self.sigmas:.1f} sigma, {self.handoffs} hand-offs)"
+        )
+
+
+def handoff_bias(handoffs: Sequence[MatchedHandoff]) -> tuple[HandoffBias, ...]:
+    """Return the mean offset of each camera with two or more accepted matches of one mast file."""
+    groups: dict[tuple[str, str], list[tuple[FloatArray, FloatArray]]] = {}
+    for one in handoffs:
+        source = one.pair[0].rpartition("_")[0]
+        for camera, landed in one.found.items():
+            assert landed.found_px is not None and landed.found_covariance_px2 is not None
+            covariance = landed.geometric_covariance_px2 + landed.found_covariance_px2
+            groups.setdefault((source, camera), []).append(
+                (landed.found_px - landed.geometric_px, covariance + MODEL_PX**2 * np.eye(2))
+            )
+    return tuple(
+        _mean(source, camera, np.array([o for o, _ in seen]), np.array([c for _, c in seen]))
+        for (source, camera), seen in groups.items()
+        if len(seen) > 1
+    )
+
+
+def _mean(source: str, camera: str, off_px: FloatArray, covariance_px2: FloatArray) -> HandoffBias:
+    weights = np.linalg.inv(covariance_px2)
+    apart = off_px - np.median(off_px, axis=0)
+    statistics = np.einsum("ni,nij,nj->n", apart, weights, apart)
+    keep = statistics <= at_least_stated(statistics) * chance_limit(Level.MEASUREMENT, len(off_px))
+    information = weights[keep].sum(axis=0)
+    mean = np.linalg.solve(information, np.einsum("nij,nj->i", weights[keep], off_px[keep]))
+    rest = off_px[keep] - mean
+    freedom = 2.0 * int(keep.sum()) - 2.0  # the better half is always kept, of two offsets both
+    chi2 = float(np.einsum("ni,nij,nj->", rest, weights[keep], rest))
+    scale = max(1.0, chi2 / freedom)
+    probability = chance(float(mean @ information @ mean), 2, scale, freedom)
+    return HandoffBias(
+        source,
+        camera,
+        int(keep.sum()),
+        int(np.sum(~keep)),
+        mean,
+        np.linalg.inv(information) * scale,
+        probability,
+        sigmas(probability),
+    )

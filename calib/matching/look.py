@@ -29,7 +29,7 @@ from calib.geometry.covariance import MOST_SIGMAS
 from calib.geometry.rigid import FloatArray, Rigid, moved_rigid
 from calib.geometry.significance import Level, chance, sigmas
 from calib.matching.partner import find_partner
-from calib.matching.patch import match_patch
+from calib.matching.patch import PatchMatch, match_patch, worst_px2
 from calib.matching.track import (
     SIZES,
     KeyPicture,
@@ -43,7 +43,6 @@ from calib.matching.track import (
     on_surface,
     outgrown,
 )
-from calib.matching.verdict import PatchMatch, worst_px2
 from calib.matching.warp import Plane, PosedImage
 
 STEPS = 20
@@ -100,69 +99,34 @@ def one_point(
     return None
 
 
-@dataclass(frozen=True, eq=False)
-class PoseDoubt:
-    """The evidence of pictures against a motion.
-
-    Attributes
-    ----------
-    off_m
-        (3,) where the pictures put the target less where the motion did, rover frame of now.
-    sigmas
-        How unlikely that is by chance, as a normal error's number of sigmas.
-    sure
-        Whether what was found is the track's target by the rules of `seen_by`; else it may be another thing.
-    """
-
-    off_m: FloatArray
-    sigmas: float
-    sure: bool = True
-
-    @property
-    def sentence(self) -> str:
-        """It as a sentence."""
-        off = f"{100 * float(np.linalg.norm(self.off_m)):.1f} cm ({self.sigmas:.1f} sigma)"
-        wrong = "the pose is wrong by more than its covariance says"
-        if self.sure:
-            return f"the pictures put the target {off} from where the pose does: {wrong}"
-        return (
-            f"the pictures show what looks like the target {off} from where the pose puts it: {wrong}, "
-            "or that is another thing"
-        )
-
-
-def pose_doubt(
-    believed_m: FloatArray, covariance_m2: FloatArray, seen: OnePoint, sure: bool = True
-) -> PoseDoubt | None:
+def pose_doubt(believed_m: FloatArray, covariance_m2: FloatArray, seen: OnePoint, sure: bool = True) -> str:
     """Return what a place by the pictures alone says against a believed one, as the motion carried it.
 
-    ``sure`` as in `PoseDoubt`. None if it says nothing that chance does not.
+    One sentence, empty if it says nothing that chance does not. ``sure``: what was found is the track's
+    target by the rules of `seen_by`; else it may be another thing.
     """
     off = seen.position_m - believed_m
-    statistic = float(off @ np.linalg.solve(covariance_m2 + seen.covariance_m2, off))
-    probability = chance(statistic, 3)
-    return PoseDoubt(off, sigmas(probability), sure) if probability < Level.STATED else None
+    probability = chance(float(off @ np.linalg.solve(covariance_m2 + seen.covariance_m2, off)), 3)
+    if probability >= Level.STATED:
+        return ""
+    size = f"{100 * float(np.linalg.norm(off)):.1f} cm ({sigmas(probability):.1f} sigma)"
+    wrong = "the pose is wrong by more than its covariance says"
+    if sure:
+        return f"the pictures put the target {size} from where the pose does: {wrong}"
+    return (
+        f"the pictures show what looks like the target {size} from where the pose puts it: {wrong}, "
+        "or that is another thing"
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class TrackLook:
-    """The result of one search.
+    """The track after one search, and the match in each camera, by name.
 
-    Attributes
-    ----------
-    track
-        The track after it.
-    found
-        By camera name: the match in that camera, with its verdict.
-    reason
-        Why the target is lost, one sentence; empty while it is tracked.
-    chi2
-        The weighted misfit of pixels and prediction; not-a-number if nothing was found.
-    renewed
-        Whether the key picture is now one of these.
-    doubt
-        The evidence of both cameras against the motion since the last search, if any; the target may be
-        tracked all the same.
+    ``reason`` is why the target is lost, one sentence; empty while it is tracked. ``chi2`` is the weighted
+    misfit of pixels and prediction, not-a-number if nothing was found; ``renewed``: the key picture is now
+    one of these. ``doubt`` is the evidence of both cameras against the motion since the last search
+    (`pose_doubt`); the target may be tracked all the same.
     """
 
     track: Track
@@ -170,7 +134,7 @@ class TrackLook:
     reason: str = ""
     chi2: float = math.nan
     renewed: bool = False
-    doubt: PoseDoubt | None = None
+    doubt: str = ""
 
 
 def seen_by(track: Track, images: Images, settings: TrackSettings | None = None) -> TrackLook:
@@ -183,12 +147,12 @@ def seen_by(track: Track, images: Images, settings: TrackSettings | None = None)
     if look.track.state == "lost" and track.standby is not None and images:
         again = _seen(replace(track, key=track.standby, standby=None), images, settings)
         look = replace(again, renewed=True) if again.track.state == "tracked" else look
-    if look.track.state == "lost" and look.doubt is None and track.state == "tracked":
+    if look.track.state == "lost" and not look.doubt and track.state == "tracked":
         look = replace(look, doubt=_seen_elsewhere(track, images, settings))
     return look
 
 
-def _seen_elsewhere(track: Track, images: Images, settings: TrackSettings) -> PoseDoubt | None:
+def _seen_elsewhere(track: Track, images: Images, settings: TrackSettings) -> str:
     """What a wider window shows of a target that is not where the motion since the last search put it.
 
     Both cameras must know the key picture well and mean one point. The target stays lost all the same: so far
@@ -196,14 +160,14 @@ def _seen_elsewhere(track: Track, images: Images, settings: TrackSettings) -> Po
     """
     key = anchored(track)
     if key is None or len(images) < 2 or not track.motion_covariance.any():
-        return None
+        return ""
     plane, wide = Plane(track.position_m, track.key.normal), replace(settings, least_px=settings.most_px)
     found = {name: _found(track, key, plane, image, wide) for name, image in images.items()}
     if any(m.verdict != "good" or m.correlation < settings.renew_below for m in found.values()):
-        return None
+        return ""
     seen = one_point(track.position_m, UNKNOWN_M**2 * np.eye(3), _pixels(found, images), settings.model_px)
     if seen is None or seen.chi2 > MOST_SIGMAS**2:
-        return None
+        return ""
     return pose_doubt(track.position_m, track.covariance_m2, seen, sure=False)
 
 
@@ -228,19 +192,19 @@ def _seen(track: Track, images: Images, settings: TrackSettings) -> TrackLook:
     point = one_point(track.position_m, track.covariance_m2, sightings, settings.model_px)
     if point is None:
         return _lost(track, found, "the found pixels and the prediction have no point in common")
-    doubt = None
-    if len(good) > 1 and track.motion_covariance.any():
-        seen = one_point(point.position_m, UNKNOWN_M**2 * np.eye(3), sightings, settings.model_px)
-        doubt = None if seen is None else pose_doubt(track.position_m, track.covariance_m2, seen)
     # 13.8: as `TrackSettings.worst_chi2`, of the two pixel coordinates of one camera.
     allowed = settings.worst_chi2 if len(good) > 1 else 13.8
+    doubt = ""
+    if len(good) > 1 and track.motion_covariance.any():
+        seen = one_point(point.position_m, UNKNOWN_M**2 * np.eye(3), sightings, settings.model_px)
+        if seen is not None:
+            doubt = pose_doubt(track.position_m, track.covariance_m2, seen, sure=point.chi2 <= allowed)
     if point.chi2 > allowed:
         reason = (
             f"the match does not fit the prediction: weighted misfit {point.chi2:.0f}, at most "
             f"{allowed:g} is expected"
         )
-        unsure = doubt and replace(doubt, sure=False)
-        return replace(_lost(track, found, reason), chi2=point.chi2, doubt=unsure)
+        return replace(_lost(track, found, reason), chi2=point.chi2, doubt=doubt)
     turned = _turned(track, point.position_m)
     fresh = fresh_key(track.key, images, good, plane, slope)
     renewed = fresh is not None and outgrown(track.key, images, good, plane, settings)

@@ -16,8 +16,8 @@ import numpy as np
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
-from calib.matching.sweep import FARTHEST_M
 from calib.matching.warp import (
+    FARTHEST_M,
     GRAZING,
     Grey,
     Plane,

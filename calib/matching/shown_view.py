@@ -9,7 +9,7 @@ further. Ranges come from the other camera of the earlier moment where there is 
 at any range from ``nearest_m`` on, and what that leaves open of the angles is the bound ``parallax_rad``.
 
 Not decided here: what follows from a contradiction. Not reported here: changes below the tolerance of
-`ViewLimits`, which joints with play make themselves, and a picture of another moment of the same view.
+`FLOOR_RAD`, which joints with play make themselves, and a picture of another moment of the same view.
 """
 
 from __future__ import annotations
@@ -44,6 +44,17 @@ REPORTED, ANYWHERE = (5, 0.25), (6, 0.4)
 """How many patches, and which share of those that a view should show, must agree on it: the reported view
 needs fewer, since a large thing may have moved in the picture, than one that is searched for everywhere."""
 
+FLOOR_RAD = 7e-3
+"""How much shown and reported angles of each joint may differ: what a sound head leaves between readings and
+pictures of two poses. The full backlash of a 12-bit servo is 4.4 mrad, half a count at either end 1.5
+mrad."""
+SHARE = 0.01
+"""The same, as a part of the way between the poses: camera models of that quality."""
+SIGMAS = 5.3
+"""The same, in sigmas of the fit: one chance in a million for two angles."""
+NEAREST_M = 0.4
+"""Nothing is nearer to the camera."""
+
 ViewVerdict = Literal["seen", "small_move", "contradicted", "unlike", "too_plain", "no_overlap"]
 
 
@@ -72,48 +83,19 @@ class Posed:
 
 
 @dataclass(frozen=True)
-class ViewLimits:
-    """The allowed difference of reported and shown angles.
-
-    Attributes
-    ----------
-    floor_rad
-        Of each joint: what a sound head leaves between readings and pictures of two poses. The full
-        backlash of a 12-bit servo is 4.4 mrad, half a count at either end 1.5 mrad together.
-    share
-        Of the way between the poses: camera models of that quality.
-    sigmas
-        Of the fit: 5.3 is one chance in a million for two angles.
-    nearest_m
-        Nothing is nearer to the camera.
-    """
-
-    floor_rad: float = 7e-3
-    share: float = 0.01
-    sigmas: float = 5.3
-    nearest_m: float = 0.4
-
-
-@dataclass(frozen=True)
 class ShownView:
-    """The view that a picture shows.
+    """The view that a picture shows; angles are not-a-number if none was found.
 
-    Attributes
-    ----------
-    verdict
-        ``seen``: the reported one. ``small_move``: the reported one, but the way is so small that the picture
-        of before would pass too, or that the shown view is as near to the one before. ``contradicted``:
-        another one. ``unlike``: nothing of what the earlier picture shows, though much of it should be there.
-        ``too_plain``: too little texture, or a pattern that fits both views. ``no_overlap``: the reported
-        view shares too little with the earlier one, and the picture shows none of it either.
-    pan_rad, tilt_rad
-        The shown view; not-a-number if none was found.
-    off_rad, sigma_rad, allowed_rad
-        (pan, tilt): shown less reported, one sigma of the fit, and how large the difference may be.
-    off_px
-        How far the shown view moves the patches against the reported one, root of the mean square.
-    agreeing, expected
-        Patches that agree on the view, and that it should show.
+    ``verdict`` is ``seen``: the reported one. ``small_move``: the reported one, but the way is so small that
+    the picture of before would pass too, or that the shown view is as near to the one before.
+    ``contradicted``: another one. ``unlike``: nothing of what the earlier picture shows, though much of it
+    should be there. ``too_plain``: too little texture, or a pattern that fits both views. ``no_overlap``: the
+    reported view shares too little with the earlier one, and the picture shows none of it either.
+
+    ``off_rad``, ``sigma_rad`` and ``allowed_rad`` are, of (pan, tilt), shown less reported, one sigma of the
+    fit, and how large the difference may be; ``off_px`` how far the shown view moves the patches against the
+    reported one, root of the mean square; ``agreeing`` and ``expected`` patches that agree on the view, and
+    that it should show.
     """
 
     verdict: ViewVerdict
@@ -133,39 +115,37 @@ def shown_view(
     before: Posed,
     after: Posed,
     beside: tuple[str, Posed] | None = None,
-    limits: ViewLimits | None = None,
 ) -> ShownView:
     """Return which view a later picture of a head camera shows.
 
     The angles reported for the picture ``before`` are believed, those for ``after`` are checked. ``beside``
     is name and picture of the other camera at the earlier moment, for ranges.
     """
-    limits = limits or ViewLimits()
-    pictures = _Comparison(rig, camera, before, after, limits)
+    pictures = _Comparison(rig, camera, before, after)
     reported, start = np.array(after.angles_rad), np.array(before.angles_rad)
     every, inside = pictures.patches(beside)
     if len(every.places) < LEAST_PATCHES:
         return ShownView("too_plain", expected=len(every.places))
     overlaps = len(inside.places) >= LEAST_PATCHES
     if overlaps:
-        fit = pictures.at(inside, reported, 1.5 * limits.floor_rad)
+        fit = pictures.at(inside, reported, 1.5 * FLOOR_RAD)
         if fit is not None and _enough(fit, REPORTED):
-            shown = _shown(fit, reported, start, limits)
+            shown = _shown(fit, reported, start)
             if shown.verdict == "contradicted":
-                fit = pictures.at(inside, fit.angles_rad, limits.floor_rad) or fit
-                return _shown(fit, reported, start, limits)
+                fit = pictures.at(inside, fit.angles_rad, FLOOR_RAD) or fit
+                return _shown(fit, reported, start)
             if shown.verdict == "seen":
-                rival = pictures.at(inside, start, limits.floor_rad)
-                stayed = rival is not None and (np.abs(rival.angles_rad - start) <= limits.floor_rad).all()
+                rival = pictures.at(inside, start, FLOOR_RAD)
+                stayed = rival is not None and (np.abs(rival.angles_rad - start) <= FLOOR_RAD).all()
                 if rival is not None and stayed and rival.agreeing >= 0.8 * fit.agreeing:
                     # The same match, between the two views: the head played back. Else a pattern.
-                    if (np.abs(rival.angles_rad - fit.angles_rad) <= limits.floor_rad / 2).all():
+                    if (np.abs(rival.angles_rad - fit.angles_rad) <= FLOOR_RAD / 2).all():
                         return replace(shown, verdict="small_move")
                     return ShownView("too_plain", expected=fit.expected, agreeing=fit.agreeing)
             return shown
     fit = pictures.anywhere(inside if overlaps else every.some(_spread(np.arange(len(every.places)))))
     if fit is not None:
-        return _shown(fit, reported, start, limits)
+        return _shown(fit, reported, start)
     if not overlaps:
         return ShownView("no_overlap", expected=len(inside.places))
     rich = len(after.places) >= LEAST_PATCHES
@@ -189,12 +169,10 @@ def _enough(fit: AgreedView, least: tuple[int, float]) -> bool:
     return fit.agreeing >= max(least[0], least[1] * fit.expected)
 
 
-def _shown(fit: AgreedView, reported: FloatArray, start: FloatArray, limits: ViewLimits) -> ShownView:
+def _shown(fit: AgreedView, reported: FloatArray, start: FloatArray) -> ShownView:
     """What a fit says about the reported view."""
     off, way = fit.angles_rad - reported, np.abs(reported - start)
-    allowed = (
-        limits.floor_rad + limits.share * float(way.max()) + fit.parallax_rad + limits.sigmas * fit.sigma_rad
-    )
+    allowed = FLOOR_RAD + SHARE * float(way.max()) + fit.parallax_rad + SIGMAS * fit.sigma_rad
     verdict: ViewVerdict = "small_move" if (way <= allowed).all() else "seen"
     if (np.abs(off) > allowed).any():
         verdict = "contradicted"
@@ -232,8 +210,8 @@ class _Patches:
 class _Comparison:
     """One camera's two pictures."""
 
-    def __init__(self, rig: Rig, name: str, before: Posed, after: Posed, limits: ViewLimits) -> None:
-        self._rig, self._name, self._limits = rig, name, limits
+    def __init__(self, rig: Rig, name: str, before: Posed, after: Posed) -> None:
+        self._rig, self._name = rig, name
         self._before_rad, self._reported_rad = np.array(before.angles_rad), np.array(after.angles_rad)
         self._places, self._earlier, self._later = before.places, before.reduced, after.reduced
         self._step = self._earlier.step
@@ -246,7 +224,7 @@ class _Comparison:
         camera = self._camera(self._before_rad)
         pixels = self._earlier.to_full(self._places)
         rays, sides = camera.ray(pixels), camera.ray(pixels[:, None] + HALF * self._step * SIDES)
-        half = np.full(len(pixels), 0.5 / self._limits.nearest_m)
+        half = np.full(len(pixels), 0.5 / NEAREST_M)
         every = _Patches(self._places, rays.origins_m, rays.directions, half, half, sides.directions).some(
             rays.valid & sides.valid.all(axis=1)
         )
@@ -264,7 +242,7 @@ class _Comparison:
         """The patches with ranges from the other camera; without one where it shows nothing alike."""
         other = picture.reduced
         camera = self._rig.camera_in_rover(name, *picture.angles_rad)
-        tried = np.linspace(1e-4, 1.0 / self._limits.nearest_m, RANGES)
+        tried = np.linspace(1e-4, 1.0 / NEAREST_M, RANGES)
         points = patches.origins_m[:, None] + patches.directions[:, None] / tried[:, None]
         pixels, valid = camera.project(points)
         lines = other.from_full(pixels)
@@ -337,7 +315,7 @@ class _Comparison:
         for start in (self._before_rad, *self._voted(patches)):
             fit = self.at(patches, start, CLUSTER_RAD)
             if fit is not None and fit.agreeing >= LEAST_PATCHES - 1:
-                fits.append(self.at(patches, fit.angles_rad, self._limits.floor_rad) or fit)
+                fits.append(self.at(patches, fit.angles_rad, FLOOR_RAD) or fit)
         good = [fit for fit in fits if _enough(fit, ANYWHERE)]
         return max(good, key=lambda fit: (fit.agreeing, fit.correlation), default=None)
 

@@ -29,8 +29,14 @@ from calib.geometry.rigid import FloatArray, Rigid, carried_covariance, rigid_ra
 from calib.geometry.stereo import triangulate
 from calib.matching.least_squares import gaussian
 from calib.matching.partner import find_partner, normal_seen
-from calib.matching.patch import match_patch, near_covariance, near_half_px
-from calib.matching.verdict import MatchSettings, PatchMatch, texture_lacks
+from calib.matching.patch import (
+    MatchSettings,
+    PatchMatch,
+    match_patch,
+    near_covariance,
+    near_half_px,
+    texture_lacks,
+)
 from calib.matching.warp import Grey, Plane, PosedImage, patch_grid
 
 State = Literal["tracked", "lost"]

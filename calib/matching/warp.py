@@ -23,6 +23,7 @@ Grey = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 SIDES = np.array([[-1.0, 0.0], [1.0, 0.0], [0.0, -1.0], [0.0, 1.0]])  # left, right, top, bottom
+FARTHEST_M = 1e4  # as good as infinity for any stereo base on a rover
 GRAZING = 0.03  # sine of the flattest view of a plane that is still believed (1.7 degrees)
 KNOTS = np.array([-1.0, -1 / 3, 1 / 3, 1.0])  # across a patch, in units of its half side
 

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from calib.geometry.handoff import Joints, PredictedPixel
-from calib.matching.handed_over import Landed, MatchedHandoff
-from calib.matching.handoff import RefinedPixel, RefinedVerdict
+from calib.matching.handoff import Landed, MatchedHandoff, RefinedPixel, RefinedVerdict
 from mastctl.watch.handoffs import read_log
 from tools.studies import handoff as study
 from tools.studies.handoff import handoff_rows, write_handoffs

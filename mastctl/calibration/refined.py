@@ -22,7 +22,7 @@ from calib.errors import NoCorrection
 from calib.files.mast_file import StoredRig
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
-from calib.matching.handed_over import HandoffBias, MatchedHandoff, handoff_bias
+from calib.matching.handoff import HandoffBias, MatchedHandoff, handoff_bias
 from mastctl.calibration.mast_file import picked, rounded_matrix, save_new, with_correction
 from mastctl.watch.handoffs import ReadLog
 

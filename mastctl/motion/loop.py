@@ -32,7 +32,7 @@ from calib.geometry.pointing import Solution, solve
 from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import Triangulation, triangulate
 from calib.matching.partner import StereoMatch
-from calib.matching.verdict import PatchMatch
+from calib.matching.patch import PatchMatch
 from drivers.errors import DriverError
 from mastctl.answers import Pointing, PointingResult, Preview
 from mastctl.as_json import as_json

@@ -18,11 +18,9 @@ from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
-from calib.matching.partner import StereoMatch, find_partner
-from calib.matching.patch import match_patch
-from calib.matching.shown_view import Posed, ShownView, overlap, shown_view
-from calib.matching.sweep import UP
-from calib.matching.verdict import MatchSettings, PatchMatch
+from calib.matching.partner import UP, StereoMatch, find_partner
+from calib.matching.patch import MatchSettings, PatchMatch, match_patch
+from calib.matching.shown_view import FLOOR_RAD, Posed, ShownView, overlap, shown_view
 from calib.matching.warp import Plane, PosedImage, Relief, carry, facing_plane, grey
 from drivers.errors import BadFrame, DriverError
 from mastctl.devices.frames import StampedFrame
@@ -174,7 +172,7 @@ class RigCameras:
         None of a move that is smaller than what need not show, or that leaves too little in common.
         """
         way_rad = max(abs(goal - start) for goal, start in zip(goal_rad, start_rad, strict=True))
-        if way_rad <= self._settings.view.floor_rad:
+        if way_rad <= FLOOR_RAD:
             return []
         wanted = [
             name
@@ -200,7 +198,7 @@ class RigCameras:
                 continue
             before, beside = self._before[name]
             after = _posed(view)
-            shown = shown_view(self._rig, name, before, after, beside, self._settings.view)
+            shown = shown_view(self._rig, name, before, after, beside)
             evidence[name] = _facts(shown)
             if shown.verdict in ("contradicted", "unlike"):
                 refused = refused or BadFrame(

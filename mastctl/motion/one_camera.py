@@ -25,7 +25,8 @@ from calib.geometry.line_of_sight import (
 )
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
-from calib.matching.verdict import PatchMatch
+from calib.matching.patch import PatchMatch
+from calib.matching.shown_view import FLOOR_RAD
 from calib.matching.warp import Plane, facing_plane
 from mastctl.devices.keep_out import Pair
 from mastctl.motion.measurement import CameraView, Clicked, rounded
@@ -121,7 +122,7 @@ class OneCamera:
         beside_px = float(np.linalg.norm(off - at * along))
         model = now.camera
         focal_px = model.focal_px[0]
-        most_px = self._settings.across_px + self._settings.view.floor_rad * focal_px
+        most_px = self._settings.across_px + FLOOR_RAD * focal_px
         if beside_px > most_px:
             raise PointingError(
                 "off_the_line",

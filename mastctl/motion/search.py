@@ -27,11 +27,10 @@ from calib.geometry.pointing import Solution, solve
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import stereo_range_error_m
-from calib.matching.handed_over import MatchedHandoff, matched_handoff
-from calib.matching.handoff import RefineSettings, refine_handoff
+from calib.matching.handoff import MatchedHandoff, RefineSettings, matched_handoff, refine_handoff
 from calib.matching.look import TrackLook, seen_by
+from calib.matching.patch import PatchMatch
 from calib.matching.track import Track, start_track
-from calib.matching.verdict import PatchMatch
 from drivers.clock import Clock
 from mastctl.answers import CameraPixel, Step
 from mastctl.devices.joint_history import HeadReading
@@ -243,7 +242,7 @@ class TargetSearch(Steps):
             pixels,
             look.chi2,
             look.renewed,
-            "" if look.doubt is None else look.doubt.sentence,
+            look.doubt,
         )
 
     def _choices(self, position_m: FloatArray) -> list[PairChoice]:

@@ -10,8 +10,7 @@ from typing import Annotated
 from pydantic import Field
 
 from calib.files.records import ABSENT, PathInFile, Record
-from calib.matching.shown_view import ViewLimits
-from calib.matching.verdict import MatchSettings
+from calib.matching.patch import MatchSettings
 from mastctl.devices.joint_history import DITHER_RAD
 
 
@@ -59,7 +58,6 @@ class PointingSettings:
     """Of a pixel for the position's covariance: noise and calibration. What the match in the other camera
     shows is added, so that a position on rough ground is reported as less sure."""
     small_half_px: int = 12  # half patch that is tried after a move where the usual one fits nowhere
-    view: ViewLimits = field(default_factory=ViewLimits)
     """What may lie between the view that joints state and the one that an image shows."""
     match: MatchSettings = field(
         default_factory=partial(

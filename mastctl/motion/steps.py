@@ -15,7 +15,7 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.pointing import Solution, ordered
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
-from calib.matching.verdict import PatchMatch
+from calib.matching.patch import PatchMatch
 from drivers.clock import Clock
 from drivers.errors import DriverError
 from drivers.interfaces import AxisReport

@@ -18,7 +18,7 @@ import numpy as np
 
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid, carried_covariance, quaternion_of
-from calib.matching.handed_over import MatchedHandoff
+from calib.matching.handoff import MatchedHandoff
 from calib.matching.track import Track, moved_track
 from drivers.clock import Clock
 from mastctl.answers import Handover, PoseTold, TrackStands, TrackState

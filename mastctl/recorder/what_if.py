@@ -25,7 +25,7 @@ from calib.geometry.pointing import solve
 from calib.geometry.rig import UNKNOWN, Approach, Rig
 from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import triangulate
-from calib.matching.handed_over import MatchedHandoff
+from calib.matching.handoff import MatchedHandoff
 
 STEP_PX = 0.01
 STEP_RAD = 1e-6

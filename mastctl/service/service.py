@@ -16,7 +16,7 @@ from importlib.metadata import version
 from typing import Any
 
 from calib.files.mast_file import StoredRig
-from calib.matching.handed_over import MatchedHandoff
+from calib.matching.handoff import MatchedHandoff
 from drivers.clock import Clock, SystemClock
 from drivers.hardware import Hardware, clock_for, head_name
 from drivers.simulation_clock import SimulationClock

@@ -28,8 +28,7 @@ from calib.files.mast_file import CameraName
 from calib.files.records import Moment, Number, Pair, Record, Text, problem, read_record
 from calib.files.yaml_text import plain
 from calib.geometry.handoff import Joints
-from calib.matching.handed_over import HandoffBias, Landed, MatchedHandoff, handoff_bias
-from calib.matching.handoff import RefinedVerdict
+from calib.matching.handoff import HandoffBias, Landed, MatchedHandoff, RefinedVerdict, handoff_bias
 from drivers.clock import Clock
 from drivers.recordings.mcap_file import BadRecording, is_mcap, read_messages
 from mastctl.answers import OffsetTold, SelfCheck

@@ -32,7 +32,7 @@ from calib.geometry.pointing import choose
 from calib.geometry.rig import Rig
 from calib.matching.handoff import RefinedPixel, RefineSettings, refine_handoff
 from calib.matching.partner import find_partner
-from calib.matching.verdict import MatchSettings
+from calib.matching.patch import MatchSettings
 from calib.matching.warp import Plane, PosedImage, warp_patch
 from drivers.sim import kernels
 from drivers.sim import scene as site

@@ -22,8 +22,7 @@ from calib.files.mast_file import load_rig
 from calib.geometry.handoff import Joints, hand_off
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid, moved_rigid
-from calib.matching.handed_over import MatchedHandoff, matched_handoff
-from calib.matching.handoff import RefinedPixel
+from calib.matching.handoff import MatchedHandoff, RefinedPixel, matched_handoff
 from mastctl.calibration.landing import handoff_errors_px
 from mastctl.cli.options import at_least, not_negative, positive_number
 from mastctl.cli.tasks import results_of

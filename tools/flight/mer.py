@@ -29,8 +29,7 @@ from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import FloatArray, Rigid
 from calib.geometry.stereo import triangulate
 from calib.matching.partner import find_partner
-from calib.matching.patch import match_patch
-from calib.matching.verdict import MatchSettings, rivalled
+from calib.matching.patch import MatchSettings, match_patch, rivalled
 from calib.matching.warp import Plane, PosedImage, grey
 from drivers.clock import ManualClock
 from drivers.recordings.pds3 import PdsProduct, read_product

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from calib.files.mast_file import load_rig
-from calib.matching.handed_over import handoff_bias
+from calib.matching.handoff import handoff_bias
 from mastctl.cli import output
 from mastctl.cli.daemon import DAEMON, client_of
 from mastctl.cli.options import add_options, at_least

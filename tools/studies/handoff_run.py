@@ -19,8 +19,7 @@ from calib.geometry.covariance import stored_covariance
 from calib.geometry.handoff import Joints, PredictedPixel, hand_off
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
-from calib.matching.handed_over import MatchedHandoff, matched_handoff
-from calib.matching.handoff import RefinedPixel, refine_handoff
+from calib.matching.handoff import MatchedHandoff, RefinedPixel, matched_handoff, refine_handoff
 from calib.matching.warp import PosedImage, grey
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.experiment.pointing import ClickTruth

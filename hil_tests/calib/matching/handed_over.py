@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.handoff import Joints
 from calib.geometry.rig import Rig, RigCamera
-from calib.matching.handed_over import Landed, MatchedHandoff
+from calib.matching.handoff import Landed, MatchedHandoff
 
 Vectors = Mapping[str, np.ndarray]
 HAZCAMS = ("hazcam_left", "hazcam_right")

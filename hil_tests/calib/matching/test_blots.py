@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 
 from calib.geometry.cahvor import CameraModel
-from calib.matching.patch import match_patch
-from calib.matching.verdict import MatchSettings
+from calib.matching.patch import MatchSettings, match_patch
 from calib.matching.warp import PosedImage, facing_plane
 
 SIZE_PX = (160, 160)

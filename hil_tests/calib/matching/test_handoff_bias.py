@@ -7,7 +7,7 @@ import pytest
 
 from calib.geometry.handoff import Joints
 from calib.geometry.significance import chance, sigmas
-from calib.matching.handed_over import Landed, MatchedHandoff, handoff_bias
+from calib.matching.handoff import Landed, MatchedHandoff, handoff_bias
 
 
 def record(off_px: np.ndarray) -> list[MatchedHandoff]:

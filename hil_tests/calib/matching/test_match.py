@@ -13,12 +13,13 @@ from scipy.interpolate import RectBivariateSpline
 from calib.errors import CalibError
 from calib.matching.least_squares import LeastSquaresMatch
 from calib.matching.partner import find_partner
-from calib.matching.patch import correlations, match_patch
-from calib.matching.verdict import (
+from calib.matching.patch import (
     MatchSettings,
     PatchMatch,
+    correlations,
     expected_correlation,
     judged,
+    match_patch,
     texture_lacks,
 )
 from calib.matching.warp import Plane, PosedImage, Relief, Surface, Template, carry, facing_plane, grey

@@ -10,8 +10,7 @@ import pytest
 
 from calib.files.mast_file import load_rig
 from calib.geometry.handoff import Joints, hand_off
-from calib.matching.handed_over import MatchedHandoff, matched_handoff
-from calib.matching.handoff import RefinedPixel
+from calib.matching.handoff import MatchedHandoff, RefinedPixel, matched_handoff
 from hil_tests.calib.matching.handed_over import NAVCAMS, pixel, plain_rig, vectors
 
 AT = Joints(0.1, -0.6)

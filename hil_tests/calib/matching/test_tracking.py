@@ -113,10 +113,7 @@ def test_a_pose_10_cm_wrong_and_told_as_good_to_15_mm_is_said_to_be(
     begun: Track, wrong_m: list[float]
 ) -> None:
     look = after_a_wrong_pose(begun, wrong_m, TOLD)
-    assert look.doubt is not None
-    # The pictures put the target as much nearer as the pose was too near, and the other way round.
-    assert np.abs(look.doubt.off_m - wrong_m).max() < 0.012
-    size = re.search(r"([\d.]+) cm \(([\d.]+) sigma\)", look.doubt.sentence)
+    size = re.search(r"([\d.]+) cm \(([\d.]+) sigma\)", look.doubt)
     assert size is not None and float(size[2]) > 3.3
     assert float(size[1]) == pytest.approx(100 * np.linalg.norm(wrong_m), abs=1.2)
 
@@ -125,16 +122,15 @@ def test_a_target_that_is_kept_after_a_wrong_pose_is_kept_with_the_doubt(begun: 
     """9 cm along the range: just within what a look takes, and more than once in a thousand by chance."""
     look = after_a_wrong_pose(begun, [0.09, 0.0, 0.0], TOLD)
     assert (look.track.state, look.reason) == ("tracked", "")
-    assert look.doubt is not None and look.doubt.sure
-    assert "the pose is wrong by more than its covariance says" in look.doubt.sentence
+    assert look.doubt.endswith("from where the pose does: the pose is wrong by more than its covariance says")
 
 
 def test_a_pose_that_says_how_wrong_it_is_is_not_doubted(begun: Track) -> None:
     honest = np.diag([2e-3**2] * 3 + [0.06**2] * 3)
     for wrong_m in ([0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, -0.1]):
         look = after_a_wrong_pose(begun, wrong_m, honest)
-        assert look.track.state == "tracked" and look.doubt is None
-    assert after_a_wrong_pose(begun, [0.0, 0.0, 0.0], TOLD).doubt is None
+        assert look.track.state == "tracked" and not look.doubt
+    assert not after_a_wrong_pose(begun, [0.0, 0.0, 0.0], TOLD).doubt
 
 
 def test_an_honest_motion_is_doubted_once_in_a_thousand_looks() -> None:
@@ -145,7 +141,7 @@ def test_an_honest_motion_is_doubted_once_in_a_thousand_looks() -> None:
     doubted = 0
     for one, other in rng.standard_normal((draws, 2, 3)):
         seen = OnePoint(TARGET + roots[1] @ other, noise, 0.0)
-        doubted += pose_doubt(TARGET + roots[0] @ one, prior, seen) is not None
+        doubted += pose_doubt(TARGET + roots[0] @ one, prior, seen) != ""
     # 20 expected; outside 6 to 40 once in some 10^4 repetitions.
     assert 6 <= doubted <= 40
 

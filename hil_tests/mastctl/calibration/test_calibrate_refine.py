@@ -16,7 +16,7 @@ from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.parameters import parameter_names
 from calib.geometry.rig import Rig
-from calib.matching.handed_over import MatchedHandoff
+from calib.matching.handoff import MatchedHandoff
 from hil_tests.calib.matching.handed_over import (
     HAZCAMS,
     hand_offs,

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
-from calib.matching.handed_over import MatchedHandoff
+from calib.matching.handoff import MatchedHandoff
 from drivers.clock import ManualClock
 from hil_tests.calib.matching.handed_over import (
     HAZCAMS,

@@ -13,7 +13,7 @@ import pytest
 
 from calib.errors import BadFile
 from calib.geometry.handoff import Joints
-from calib.matching.handed_over import Landed, MatchedHandoff
+from calib.matching.handoff import Landed, MatchedHandoff
 from mastctl.watch.handoffs import handoff_log, line_of, read_log
 
 
