@@ -21,7 +21,7 @@ dense block that is summed into the normal equations at once; these (some 300 un
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -29,26 +29,8 @@ import numpy as np
 
 from calib.adjust.gross import bounded
 from calib.adjust.solver import Normal
-from calib.adjust.stacks import AnyStack, ImageStack, StationStack
-from calib.adjust.terms import (
-    DRAWING,
-    JOINTS,
-    ImageTerm,
-    StationTerm,
-    lens_knowledge,
-    widened_images,
-    with_kept,
-)
-from calib.adjust.unknowns import (
-    JOINT_ERRORS,
-    MAST,
-    Estimate,
-    Key,
-    Known,
-    ResidualBlock,
-    Unknown,
-    Unknowns,
-)
+from calib.adjust.terms import DRAWING, JOINTS, ImageTerm, StationTerm, lens_knowledge, widened_images
+from calib.adjust.unknowns import JOINT_ERRORS, MAST, Estimate, Key, ResidualBlock, Unknown
 from calib.geometry.covariance import camera_rates
 from calib.geometry.parameters import (
     camera_numbers,
@@ -58,14 +40,7 @@ from calib.geometry.parameters import (
     stepped,
     twist_rates,
 )
-from calib.geometry.rig import (
-    JOINTS_NAMES,
-    MAST_FREE,
-    MAST_NAMES,
-    Gimbal,
-    gimbal,
-    joint_twists,
-)
+from calib.geometry.rig import JOINTS_NAMES, MAST_FREE, MAST_NAMES, Gimbal, gimbal, joint_twists
 from calib.geometry.rigid import FloatArray, moved_rigid, rigid_rates, rigid_twists
 
 HUBER, SCAN_HUBER = 3.0, 100.0
@@ -77,7 +52,6 @@ USUAL_JOINT_RAD = 0.01
 
 USUAL_BOW_M = 0.005
 """How far a board's edges are usually from flat, one sigma, metres."""
-
 
 PAN_TILT = [len(MAST_NAMES) + len(JOINTS_NAMES), len(MAST_NAMES) + len(JOINTS_NAMES) + 1]
 """Places of the readings among the numbers that move the head."""
@@ -95,26 +69,44 @@ class Motions(NamedTuple):
     camera: FloatArray
 
 
-class Adjustment:
-    """The least-squares problem of a survey.
+@dataclass(frozen=True, eq=False)
+class _Stack:
+    """Terms in a row, of n points in all, with unknowns of the same kinds: as many, in the same order.
 
-    Parameters
-    ----------
-    start
-        The state to start from; it settles which unknowns there are.
-    mast_parameters
-        4, 6 or 8; 0 leaves the mast as it is. Or which of its eight numbers move.
-    prisms_cad_m, prism_cad_m
-        The prisms from CAD, metres in the rover frame, and their sigma (0: exact). With a sigma, one that the
-        start has and CAD has not is known by the station alone.
-    joint_rad
-        Sigma of a joint reading (0: exact).
-    joint_errors
-        Which of ``calib.geometry.rig.JOINTS_NAMES`` move.
-    bowed, fixed
-        Boards whose bow is unknown, by the first part of their images' ``board``, and boards that stay.
-    huber
-        Length in sigmas from which pulls are bounded; None for plain least squares.
+    A fit spends its time on the Jacobians of some hundred images of some hundred dots. Numpy takes as long to
+    begin an operation on a hundred numbers as to carry it out. So all images of a camera go through each
+    operation together, and only their normal equations are summed one by one.
+
+    By term are its unknowns' ``keys``, their indices ``columns`` (k,), and where its points are (``parts``);
+    ``sizes`` says how many numbers each unknown has. ``sigma`` (n,) is in pixels or metres; points (n, 3),
+    pixels (n, 2) and ``bend`` (n, 2) are of those dots that count.
+    """
+
+    terms: tuple[Any, ...]
+    keys: tuple[tuple[Key, ...], ...]
+    columns: tuple[np.ndarray, ...]
+    sizes: tuple[int, ...]
+    parts: tuple[slice, ...]
+    sigma: FloatArray
+    in_board_m: FloatArray
+    pixels_px: FloatArray
+    bend: FloatArray
+
+    @property
+    def images(self) -> bool:
+        """Whether these are images, and no points of the station."""
+        return isinstance(self.terms[0], ImageTerm)
+
+
+class Adjustment:
+    """The least-squares problem of a survey or bench; the start settles which unknowns there are.
+
+    ``mast_parameters`` are 4, 6 or 8 (0 leaves the mast as it is), or the places of the mast's numbers that
+    move, ``joint_errors`` those of ``calib.geometry.rig.JOINTS_NAMES``. ``prism_cad_m`` is the sigma of the
+    prisms from CAD (metres in the rover frame; 0: exact): with one, a prism that the start has and CAD has
+    not is known by the station alone. ``joint_rad`` is the sigma of a joint reading (0: exact). ``bowed`` are
+    boards, the first part of their images' ``board``, whose bow is unknown, ``fixed`` those that stay. From a
+    length of ``huber`` sigmas on pulls are bounded; None is plain least squares.
     """
 
     def __init__(
@@ -140,21 +132,25 @@ class Adjustment:
         self.mast_free = np.array(mast_parameters, dtype=int)
         self.joint_errors = np.array(joint_errors, dtype=int)
         self.bowed, self.fixed = tuple(bowed), frozenset(fixed)
-        self.unknowns = Unknowns(self._declared(start))
+        declared = list(self._declared(start))
+        self.names = tuple(name for one in declared for name in one.names)
+        self.weak: FloatArray = np.concatenate([np.zeros(0), *(one.step for one in declared)]) ** -2.0
+        self._unknowns = {one.key: one for one in declared}
+        parts = _slices([len(one.names) for one in declared])
+        self._places = {
+            one.key: np.arange(part.start, part.stop) for one, part in zip(declared, parts, strict=True)
+        }
 
     def _declared(self, start: Estimate) -> Iterator[Unknown]:
         """Every unknown, once."""
         for name, model in start.cameras.items():
             names = tuple(f"cameras.{name}.{p}" for p in parameter_names(model.kind))
-            step, usual = np.ones(len(names)), np.zeros(len(names), dtype=bool)
-            for letter in dict.fromkeys(model.letters):
-                part = parameter_part(model.kind, letter)
-                step[part] = float(np.linalg.norm(model.H)) if letter in "HV" else 1.0
-                usual[part] = letter in "ORED"
-            yield Unknown(("camera", name), names, step, usual=usual)
-        yield Unknown(
-            MAST, tuple(f"mast.{MAST_NAMES[i]}" for i in self.mast_free), np.ones(len(self.mast_free))
-        )
+            step = np.ones(len(names))
+            for letter in "HV":
+                step[parameter_part(model.kind, letter)] = float(np.linalg.norm(model.H))
+            yield Unknown(("camera", name), names, step)
+        names = tuple(f"mast.{MAST_NAMES[i]}" for i in self.mast_free)
+        yield Unknown(MAST, names, np.ones(len(names)))
         errors = tuple(JOINTS_NAMES[i] for i in self.joint_errors)
         yield _usual(JOINT_ERRORS, errors, USUAL_JOINT_RAD)
         for board in self.bowed:
@@ -176,16 +172,6 @@ class Adjustment:
                 yield Unknown(key, names, np.ones(2), np.zeros(2), sigma, JOINTS)
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """(p,) the names of all numbers."""
-        return self.unknowns.names
-
-    @property
-    def weak(self) -> FloatArray:
-        """(p,) how firmly a number stays where it is if the data leave it open."""
-        return self.unknowns.weak
-
-    @property
     def upright(self) -> bool:
         """Whether the mast is taken as upright: it turns and shifts, but does not lean."""
         return set(self.mast_free.tolist()) == set(MAST_FREE[4])
@@ -200,10 +186,16 @@ class Adjustment:
 
     def with_sigmas(self, factors: Mapping[str, float]) -> Adjustment:
         """Return the same problem with sigmas times ``factors``, by kind (``calib.adjust.goodness``)."""
+        unknowns = {
+            key: replace(one, sigma=one.sigma * factors.get(one.kind, 1.0))
+            if one.sigma is not None and one.kind is not None
+            else one
+            for key, one in self._unknowns.items()
+        }
         return self._copy(
             images=widened_images(self.images, factors),
             station=tuple(replace(p, sigma_m=p.sigma_m * factors.get(p.kind, 1.0)) for p in self.station),
-            unknowns=self.unknowns.with_sigmas(factors),
+            _unknowns=unknowns,
             joint_rad=self.joint_rad * factors.get(JOINTS, 1.0),
             prism_cad_m=self.prism_cad_m * factors.get(DRAWING, 1.0),
         )
@@ -224,7 +216,7 @@ class Adjustment:
             raise ValueError("the step is not finite")
 
         def of(key: Key) -> FloatArray:
-            return step[self.unknowns.part(key)]
+            return step[self._places[key]]
 
         mast = state.mast.copy()
         mast[self.mast_free] += of(MAST)
@@ -291,20 +283,20 @@ class Adjustment:
             gradient[block.columns] += block.jacobian.T @ block.residual
         return Normal(cost, matrix, gradient)
 
-    def blocks(self, state: Estimate) -> Iterator[tuple[ImageTerm | StationTerm | Known, ResidualBlock]]:
+    def blocks(self, state: Estimate) -> Iterator[tuple[ImageTerm | StationTerm | Unknown, ResidualBlock]]:
         """Yield every group that counts, residuals and Jacobian."""
         for stack in self._stacks:
             yield from zip(stack.terms, self._blocks(state, stack), strict=True)
         yield from self.known(state)
 
     @cached_property
-    def _stacks(self) -> list[AnyStack]:
+    def _stacks(self) -> list[_Stack]:
         """Everything that counts, but what is known beforehand."""
         return self._stacked(
             [*(t for t in self.images if t.keep.any()), *(p for p in self.station if p.keep)]
         )
 
-    def _stacked(self, terms: Iterable[ImageTerm | StationTerm]) -> list[AnyStack]:
+    def _stacked(self, terms: Iterable[ImageTerm | StationTerm]) -> list[_Stack]:
         """Stacks of terms of one camera, or of the station, with unknowns of the same kinds."""
         groups: dict[tuple[object, ...], tuple[list[Any], list[tuple[Key, ...]]]] = {}
         for term in terms:
@@ -313,10 +305,23 @@ class Adjustment:
             mine = groups.setdefault(kind, ([], []))
             mine[0].append(term)
             mine[1].append(keys)
-        return [
-            (ImageStack if image else StationStack).of(*mine, self.unknowns)
-            for (image, *_), mine in groups.items()
-        ]
+        found = []
+        for mine_terms, keys_of in groups.values():
+            columns = tuple(np.concatenate([self._places[key] for key in keys]) for keys in keys_of)
+            sizes = tuple(len(self._places[key]) for key in keys_of[0])
+            if isinstance(mine_terms[0], ImageTerm):
+                parts = _slices([int(t.keep.sum()) for t in mine_terms])
+                bends = [t.bend if len(t.bend) else np.zeros((len(t.keep), 2)) for t in mine_terms]
+                every = [
+                    (t.sigma_px[t.keep], t.in_board_m[t.keep], t.pixels_px[t.keep], bend[t.keep])
+                    for t, bend in zip(mine_terms, bends, strict=True)
+                ]
+                arrays = [np.concatenate(one) for one in zip(*every, strict=True)]
+            else:
+                parts = _slices([1] * len(mine_terms))
+                arrays = [np.array([p.sigma_m for p in mine_terms]), *[np.zeros((0, 2))] * 3]
+            found.append(_Stack(tuple(mine_terms), tuple(keys_of), columns, sizes, parts, *arrays))
+        return found
 
     def _keys(self, term: ImageTerm | StationTerm) -> Iterator[Key]:
         """The unknowns that a term depends on: of an image its camera first, a bow last, between them what
@@ -376,29 +381,32 @@ class Adjustment:
 
     def without_unseen(self, state: Estimate) -> Adjustment:
         """Return the same problem without images in which a dot that counts has no pixel."""
-        off = zip(self.images, self.residuals(state, self.images), strict=True)
-        unseen = {term.name for term, residual in off if not np.isfinite(residual).all()}
-        return self.with_terms(with_kept(self.images, unseen), self.station)
+        residuals = self.residuals(state, self.images)
+        kept = [
+            t if np.isfinite(off).all() else replace(t, keep=np.zeros_like(t.keep))
+            for t, off in zip(self.images, residuals, strict=True)
+        ]
+        return self.with_terms(kept, self.station)
 
-    def _blocks(self, state: Estimate, stack: AnyStack) -> Iterator[ResidualBlock]:
+    def _blocks(self, state: Estimate, stack: _Stack) -> Iterator[ResidualBlock]:
         """The terms of a stack, each by itself."""
-        rows = self._rows(state, stack)
-        for at, part in enumerate(stack.parts):
+        rows, places = self._rows(state, stack), _slices(stack.sizes)
+        for part, columns, keys in zip(stack.parts, stack.columns, stack.keys, strict=True):
             mine = rows[..., part].transpose(2, 0, 1).reshape(-1, rows.shape[1])
-            yield ResidualBlock(mine[:, -1], mine[:, :-1], stack.columns[at], len(rows), stack.places_of(at))
+            yield ResidualBlock(mine[:, -1], mine[:, :-1], columns, dict(zip(keys, places, strict=True)))
 
-    def _off(self, state: Estimate, stack: AnyStack) -> FloatArray:
+    def _off(self, state: Estimate, stack: _Stack) -> FloatArray:
         """Predicted less measured pixels (n, 2), or measured less expected places (n, 3), in sigmas."""
-        if isinstance(stack, StationStack):
-            measured, expected = self._places(state, stack)
-            return np.asarray((measured - expected) / stack.sigma_m[:, None])
+        if not stack.images:
+            measured, expected = self._station_m(state, stack)
+            return np.asarray((measured - expected) / stack.sigma[:, None])
         model = state.cameras[stack.terms[0].camera]
         pixels, _ = model.project(self._in_camera(state, stack)[0])
-        return np.asarray((pixels - stack.pixels_px) / stack.sigma_px[:, None])
+        return np.asarray((pixels - stack.pixels_px) / stack.sigma[:, None])
 
-    def _rows(self, state: Estimate, stack: AnyStack) -> FloatArray:
+    def _rows(self, state: Estimate, stack: _Stack) -> FloatArray:
         """The Jacobian of a stack's residuals and, last, these themselves, in sigmas, (width, k + 1, n)."""
-        if isinstance(stack, StationStack):
+        if not stack.images:
             return self._station_rows(state, stack)
         in_camera, head = self._in_camera(state, stack)
         pixels_px, by_step, by_motion = camera_rates(state.cameras[stack.terms[0].camera], in_camera)
@@ -412,10 +420,10 @@ class Adjustment:
             if bow:
                 rows[:, last:-1, part] = moved[:, -1:] * stack.bend[part].T
         rows[:, -1] = (pixels_px - stack.pixels_px).T
-        rows /= stack.sigma_px
+        rows /= stack.sigma
         return rows
 
-    def _in_camera(self, state: Estimate, stack: ImageStack) -> tuple[FloatArray, Gimbal | None]:
+    def _in_camera(self, state: Estimate, stack: _Stack) -> tuple[FloatArray, Gimbal | None]:
         """Points (n, 3) in the frame that the camera is in, head or rover, metres, and where the head was."""
         boards = [state.rover_from_board[t.board] for t in stack.terms]
         turns, shifts = np.array([b.rotation for b in boards]), np.array([b.translation_m for b in boards])
@@ -435,7 +443,7 @@ class Adjustment:
             found[part] = points[part] @ turn.T + shift
         return found, head
 
-    def _twists(self, state: Estimate, stack: ImageStack, head: Gimbal | None) -> FloatArray:
+    def _twists(self, state: Estimate, stack: _Stack, head: Gimbal | None) -> FloatArray:
         """Twists (images, k, 6) by which unknowns move the points of each image in the frame that its camera
         is in: a turn, and the shift of what is carried through the origin; last, of a bow, the board's z."""
         boards = [state.rover_from_board[t.board] for t in stack.terms]
@@ -476,7 +484,7 @@ class Adjustment:
             found.append(Motions(block, by_head, rates @ focus_and_turn_rates(model)))
         return found
 
-    def _places(self, state: Estimate, stack: StationStack) -> tuple[FloatArray, FloatArray]:
+    def _station_m(self, state: Estimate, stack: _Stack) -> tuple[FloatArray, FloatArray]:
         """Where points of the station were measured and are expected (n, 3), metres in the rover frame."""
         measured = [state.rover_from_station[p.setup].points(p.position_m) for p in stack.terms]
         expected = [
@@ -487,41 +495,43 @@ class Adjustment:
         ]
         return np.array(measured), np.array(expected)
 
-    def _station_rows(self, state: Estimate, stack: StationStack) -> FloatArray:
+    def _station_rows(self, state: Estimate, stack: _Stack) -> FloatArray:
         """The same of points of the station."""
-        measured, expected = self._places(state, stack)
-        eye = np.eye(3)
+        measured, expected = self._station_m(state, stack)
+        unit = np.eye(3)
         rows = np.empty((3, sum(stack.sizes) + 1, len(measured)))
         origins = np.array([state.rover_from_station[p.setup].translation_m for p in stack.terms])
-        rows[:, :6] = rigid_rates(eye[None], measured, origins).transpose(1, 2, 0)
+        rows[:, :6] = rigid_rates(unit[None], measured, origins).transpose(1, 2, 0)
         boards = [state.rover_from_board[p.board] for p in stack.terms if p.board is not None]
         if boards:
             origins = np.array([board.translation_m for board in boards])
-            rows[:, 6:-1] = -rigid_rates(eye[None], expected, origins).transpose(1, 2, 0)
+            rows[:, 6:-1] = -rigid_rates(unit[None], expected, origins).transpose(1, 2, 0)
         elif self.prism_cad_m > 0:
-            rows[:, 6:-1] = -eye[..., None]
+            rows[:, 6:-1] = -unit[..., None]
         rows[:, -1] = (measured - expected).T
-        rows /= stack.sigma_m
+        rows /= stack.sigma
         return rows
 
-    def known(self, state: Estimate) -> Iterator[tuple[Known, ResidualBlock]]:
+    def known(self, state: Estimate) -> Iterator[tuple[Unknown, ResidualBlock]]:
         """The priors: usual lenses, joints and boards, prisms from CAD, joint readings."""
-        for key, unknown in self.unknowns.items():
-            kind, *which = key
-            if kind == "camera":
-                model = state.cameras[str(which[0])]
-                if model.kind != "CAHV":
-                    residual, rates = lens_knowledge(model)
-                    part = {key: slice(0, rates.shape[1])}
-                    yield Known(key, None), ResidualBlock(residual, rates, self.at(key), 1, part)
-            elif unknown.prior is not None and unknown.sigma is not None and len(unknown.names):
-                if kind == "attitude" and not self.joint_rad:
+        for key, unknown in self._unknowns.items():
+            if key[0] == "camera":
+                model = state.cameras[str(key[1])]
+                if model.kind == "CAHV":
                     continue
+                residual, rates = lens_knowledge(model)
+            elif (
+                unknown.prior is None
+                or unknown.sigma is None
+                or not len(unknown.names)
+                or (key[0] == "attitude" and not self.joint_rad)
+            ):
+                continue
+            else:
                 residual = (self.numbers(state, key) - unknown.prior) / unknown.sigma
-                block = ResidualBlock(
-                    residual, unknown.rates, self.at(key), 1, {key: slice(0, len(residual))}
-                )
-                yield Known(key, unknown.kind), block
+                rates = np.diag(1.0 / unknown.sigma)
+            parts = {key: slice(0, rates.shape[1])}
+            yield unknown, ResidualBlock(residual, rates, self.at(key), parts)
 
     def numbers(self, state: Estimate, key: Key) -> FloatArray:
         """Return an unknown's numbers in a state; 0 for a camera's A and O, which count from its own.
@@ -544,14 +554,19 @@ class Adjustment:
         return {
             name: float(value)
             for kind in kinds
-            for key, unknown in self.unknowns.items()
+            for key, unknown in self._unknowns.items()
             if key[0] == kind
             for name, value in zip(unknown.names, self.numbers(state, key), strict=True)
         }
 
     def at(self, key: Key) -> np.ndarray:
         """Return the indices of an unknown's numbers."""
-        return self.unknowns.at(key)
+        return self._places[key]
+
+    def of_kinds(self, *kinds: str) -> np.ndarray:
+        """Return the indices of all unknowns of some kinds, the kinds in this order."""
+        found = [at for kind in kinds for key, at in self._places.items() if key[0] == kind]
+        return np.concatenate([np.zeros(0, dtype=int), *found])
 
 
 def _usual(key: Key, names: tuple[str, ...], sigma: float) -> Unknown:
@@ -573,3 +588,9 @@ def bounded_weights(residual: FloatArray, width: int, huber: float | None) -> Fl
         return np.ones(len(residual))
     length = np.linalg.norm(residual.reshape(-1, width), axis=1)
     return np.repeat(bounded(length, huber), width)
+
+
+def _slices(sizes: Sequence[int]) -> tuple[slice, ...]:
+    """Where parts of some sizes are, one after another."""
+    ends = np.cumsum(sizes, dtype=int).tolist()
+    return tuple(slice(end - size, end) for end, size in zip(ends, sizes, strict=True))

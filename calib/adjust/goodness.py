@@ -20,7 +20,7 @@ from scipy.special import chdtr, chdtrc, fdtrc
 
 from calib.adjust.adjustment import Adjustment
 from calib.adjust.terms import PRISMS, TAPES, ImageTerm, StationTerm
-from calib.adjust.unknowns import Estimate, Known, ResidualBlock
+from calib.adjust.unknowns import Estimate, ResidualBlock, Unknown
 from calib.geometry.rigid import FloatArray
 from calib.geometry.significance import Level
 
@@ -65,7 +65,7 @@ class Component:
 
 
 def variance_components(
-    blocks: Iterable[tuple[ImageTerm | StationTerm | Known, ResidualBlock]],
+    blocks: Iterable[tuple[ImageTerm | StationTerm | Unknown, ResidualBlock]],
     covariance: FloatArray,
     weighed: Mapping[str, float] | None = None,
 ) -> tuple[Component, ...]:
@@ -96,7 +96,7 @@ def variance_components(
 
 
 def _by_kind(
-    blocks: Iterable[tuple[ImageTerm | StationTerm | Known, ResidualBlock]], size: int
+    blocks: Iterable[tuple[ImageTerm | StationTerm | Unknown, ResidualBlock]], size: int
 ) -> dict[str, tuple[float, int, FloatArray]]:
     """By kind of measurement the sum of squares, how many numbers there are, and JᵀJ of all unknowns."""
     sums: dict[str, tuple[float, int, FloatArray]] = {}

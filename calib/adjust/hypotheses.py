@@ -284,7 +284,7 @@ class ScoredFit:
             moves = rates
             if self.problem.joint_rad > 0.0:
                 key = ("attitude", image.attitude)
-                nothing = ResidualBlock(np.zeros(0), np.zeros((0, 2)), self.problem.at(key), 1)
+                nothing = ResidualBlock(np.zeros(0), np.zeros((0, 2)), self.problem.at(key))
                 block = known.pop(key, nothing)
                 rates = -block.jacobian
             found.append(self._row(image, block, rates, moves))
@@ -395,7 +395,7 @@ def _drifts(fit: ScoredFit) -> Iterator[Hypothesis]:
 
 def _placements(fit: ScoredFit) -> Iterator[Hypothesis]:
     """Placements whose pictures see other cameras, axes and joints than those of the others."""
-    compared = fit.problem.unknowns.of_kinds("mast", "joints", "camera")
+    compared = fit.problem.of_kinds("mast", "joints", "camera")
     boards = dict.fromkeys(image.board for image in fit.images)
 
     def own(_: ImageTerm, motions: Motions) -> FloatArray:

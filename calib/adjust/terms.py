@@ -155,11 +155,6 @@ def station_terms(survey: Survey, boards: Mapping[tuple[str, str], Rigid]) -> tu
     return tuple(terms)
 
 
-def with_kept(images: Sequence[ImageTerm], left_out: frozenset[str] | set[str]) -> tuple[ImageTerm, ...]:
-    """Return the terms with whole images left out by name."""
-    return tuple(replace(t, keep=np.zeros_like(t.keep)) if t.name in left_out else t for t in images)
-
-
 def widened_images(images: Sequence[ImageTerm], factors: Mapping[str, float]) -> tuple[ImageTerm, ...]:
     """Return the terms with sigmas times ``factors``, by kind."""
     return tuple(replace(t, sigma_px=t.sigma_px * factors.get(t.kind, 1.0)) for t in images)

@@ -19,7 +19,7 @@ from calib.adjust.result import (
     rig_of,
 )
 from calib.adjust.terms import ImageTerm, lens_notes
-from calib.adjust.unknowns import MAST, Estimate
+from calib.adjust.unknowns import Estimate
 from calib.geometry.covariance import landing_rates, pixel_rates
 from calib.geometry.parameters import parameter_names, parameter_part
 from calib.geometry.rig import Rig
@@ -92,7 +92,7 @@ def fitted_fields(
     unknowns that are the rig's numbers, whose covariance is ``widened`` by a factor.
     """
     rig, names = rig_of(survey, state), tuple(problem.values(state, *kinds))
-    numbers = problem.unknowns.of_kinds(*kinds)
+    numbers = problem.of_kinds(*kinds)
     of_rig = widened * covariance[np.ix_(numbers, numbers)]
     sigma = sigma_by_key(rig, names, of_rig)
     return {
@@ -190,6 +190,8 @@ def station_residuals(problem: Adjustment, state: Estimate) -> tuple[StationResi
 OPEN = 0.05
 """A direction is open if the data leave more than this part of how far it could be off at all (1 m, 1 rad,
 one focal length)."""
+
+USUAL = ("O", "R", "E", "D")
 
 SEEN_RAD = 0.05
 """A joint that moves less than this between the fitted images is called still."""
@@ -294,8 +296,8 @@ def open_directions(problem: Adjustment, covariance: FloatArray) -> tuple[Degene
 
     ``covariance`` (p, p) is of all the problem's numbers, with its weak knowledge added.
     """
-    rig = problem.unknowns.of_kinds("camera", "mast")
-    shown = rig[~problem.unknowns.usual[rig]]
+    # What lenses are usually like decides of their O, R, E and D, however little the data show of them.
+    shown = [i for i in problem.of_kinds("camera", "mast") if problem.names[i].split(".")[-2] not in USUAL]
     names = [problem.names[i] for i in shown]
     found = open_parameters(names, covariance[np.ix_(shown, shown)], problem.weak[shown])
     return tuple(Degenerate(parts, _reason(problem, parts)) for parts in found)
@@ -305,9 +307,9 @@ def _reason(problem: Adjustment, parameters: Sequence[str]) -> str:
     """Why a direction is open, and what to measure."""
     what = f"the survey does not fix {in_english(parameters)}"
     head = [t for t in problem.images if t.attitude is not None and t.keep.any()]
-    owners = {problem.unknowns.owner(name) for name in parameters}
-    cameras = {str(key[1]) for key in owners if key[0] == "camera"}
-    if head and (MAST in owners or cameras & {t.camera for t in head}):
+    owners = {name.split(".")[0] for name in parameters}
+    cameras = {name.split(".")[1] for name in parameters if name.startswith("cameras.")}
+    if head and ("mast" in owners or cameras & {t.camera for t in head}):
         pan = np.ptp([t.pan_rad for t in head])
         tilt = np.ptp([t.tilt_rad for t in head])
         still = [n for n, moved in (("pan", pan), ("tilt", tilt)) if moved < SEEN_RAD]

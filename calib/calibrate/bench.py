@@ -31,7 +31,7 @@ from calib.adjust.robust import (
 )
 from calib.adjust.scatter import print_error_m, with_scales, without_wrong, wrong_dots
 from calib.adjust.solver import minimise
-from calib.adjust.terms import ImageTerm, with_kept
+from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.bench import BenchNotFitted, SomethingChanged, bench_start, best_cut
 from calib.calibrate.starts.views import ViewPoses, ViewsTooFew, view_poses
@@ -167,7 +167,7 @@ class BenchProblem:
     def problem(self, chosen: Mapping[str, ModelTerm], state: Estimate) -> Adjustment:
         """Return the least-squares problem with some terms."""
         return Adjustment(
-            with_kept(self.images, self.doubtful),
+            [replace(t, keep=t.keep & (t.name not in self.doubtful)) for t in self.images],
             (),
             state,
             mast_parameters=[*(range(6) if self.known else ()), *term_numbers(chosen, "mast")],

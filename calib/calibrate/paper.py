@@ -76,7 +76,7 @@ def fit_paper(survey: Survey, mast_parameters: int = 6) -> Calibration:
         outliers=(*start.poses.blunders, *_left_out(images, start), *start.wrong),
         degenerate=open_directions(problem, mast_alone),
         chi2=float(sum(in_sigmas)),
-        degrees_of_freedom=float(count - len(problem.unknowns.of_kinds(*kinds))),
+        degrees_of_freedom=float(count - len(problem.of_kinds(*kinds))),
         chi2_probability=float("nan"),
         seconds=time.perf_counter() - began,
     )
@@ -97,7 +97,7 @@ def two_step_covariance(
     # The steps know cameras in the rover frame at their references, the problem those in the head.
     rates = references.rates(problem, state)
     first, second = rates.T @ first @ rates, rates.T @ second @ rates
-    k, m = problem.unknowns.of_kinds("camera"), problem.at(MAST)
+    k, m = problem.of_kinds("camera"), problem.at(MAST)
     rig, size = np.concatenate([k, m]), len(k)
     s = np.setdiff1d(np.arange(total), rig)
     steps = np.zeros((len(rig), len(rig)))

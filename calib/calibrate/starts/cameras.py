@@ -162,10 +162,6 @@ class MastAlone(Adjustment):
         rates = self.references.rates(self, state)[:, self.at(MAST)]
         return Normal(whole.cost, rates.T @ whole.matrix @ rates, rates.T @ whole.gradient)
 
-    @property
-    def weak(self) -> FloatArray:
-        return np.full(len(self.mast_free), 1e-4)
-
 
 def fit_mast(
     images: Sequence[ImageTerm],
@@ -191,7 +187,7 @@ def fit_mast(
     def start(mast: FloatArray) -> tuple[Adjustment, Estimate]:
         state = Estimate(references.in_head(mast), mast, rover_from_board=boards)
         problem = MastAlone(images, (), state, mast_parameters=mast_parameters, fixed=tuple(boards))
-        problem.references = references
+        problem.references, problem.weak = references, np.full(len(problem.mast_free), 1e-4)
         return problem, state
 
     upright = mast_parameters == 4

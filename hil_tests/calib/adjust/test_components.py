@@ -121,7 +121,7 @@ def heights(sigma_m: float, count: int, rng: np.random.Generator) -> list[tuple[
     """One unknown height, measured so often: a mean, whose redundancy is one less than the measurements."""
     term = StationTerm("s", ("s", "b"), "a", np.zeros(3), np.zeros(3), 1.0)
     measured = rng.normal(0.0, sigma_m, count)
-    return [(term, ResidualBlock(np.array([m]), np.ones((1, 1)), np.array([0]), 1)) for m in measured]
+    return [(term, ResidualBlock(np.array([m]), np.ones((1, 1)), np.array([0]))) for m in measured]
 
 
 def test_of_a_mean_it_is_the_sample_variance() -> None:

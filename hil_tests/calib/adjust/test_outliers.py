@@ -177,7 +177,7 @@ def test_a_dot_that_few_others_check_is_judged_by_what_the_fit_leaves_of_it(
     residual[20:, 0] = (
         [-off_sigmas / 3, -off_sigmas / 3, 2 * off_sigmas / 3] if fitted else [0, 0, off_sigmas]
     )
-    block = ResidualBlock(residual.ravel(), jacobian.reshape(46, 2), np.arange(2), 2)
+    block = ResidualBlock(residual.ravel(), jacobian.reshape(46, 2), np.arange(2))
     places, counts = np.zeros((23, 3)), np.arange(23)
     term = ImageTerm(
         "one", "left", ("s", "p"), None, 0, 0, counts, counts, places, residual, np.ones(23), keep
@@ -205,7 +205,7 @@ def test_an_image_left_out_is_judged_by_what_its_dots_share_beyond_noise(
     residual, places = np.zeros((20, 2)), np.zeros((20, 3))
     places[:, 0] = np.linspace(-1.0, 1.0, 20)
     residual[:, 0] = common_sigmas + own_sigmas * np.resize([1.0, -1.0], 20) + tilted_sigmas * places[:, 0]
-    block = ResidualBlock(residual.ravel(), jacobian.reshape(40, 2), np.arange(2), 2)
+    block = ResidualBlock(residual.ravel(), jacobian.reshape(40, 2), np.arange(2))
     counts = np.arange(20)
     none = np.zeros(20, dtype=bool)
     term = ImageTerm(
@@ -237,7 +237,7 @@ def test_an_image_with_two_noisy_rows_fails_by_a_common_shift_alone(shift_sigmas
         for i, off in enumerate(residual)
     ]
     rates = np.tile(np.eye(2), (88, 1))
-    blocks = [ResidualBlock(off.ravel(), rates, np.arange(2), 2) for off in residual]
+    blocks = [ResidualBlock(off.ravel(), rates, np.arange(2)) for off in residual]
     left, _ = judge(problem_of(terms, blocks), None, 1e-6 * np.eye(2), terms)  # type: ignore[arg-type]
     assert [bool(image.keep.any()) for image in left] == [stays, True, True, True, True]
 

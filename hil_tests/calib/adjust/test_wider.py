@@ -146,7 +146,7 @@ def test_the_gain_is_what_a_fit_of_both_would_find() -> None:
     x, noise = rng.uniform(-1, 1, 40), rng.normal(0, 1, 40)
     residual = -(0.7 * x + noise)
     residual -= residual.mean()
-    block = ResidualBlock(residual, np.ones((40, 1)), np.array([0]), 1)
+    block = ResidualBlock(residual, np.ones((40, 1)), np.array([0]))
     gain = Score.of([(block, x[:, None])], 1).gain(np.array([[1 / 40]]), np.zeros(1))
     both = np.column_stack([np.ones(40), x])
     found, left, *_ = np.linalg.lstsq(both, -residual, rcond=None)
@@ -158,7 +158,7 @@ def test_the_gain_is_what_a_fit_of_both_would_find() -> None:
 def test_what_the_fit_makes_up_for_gains_nothing() -> None:
     residual = np.random.default_rng(3).normal(0, 1, 40)
     residual -= residual.mean()
-    block = ResidualBlock(residual, np.ones((40, 1)), np.array([0]), 1)
+    block = ResidualBlock(residual, np.ones((40, 1)), np.array([0]))
     gain = Score.of([(block, np.full((40, 1), 5.0))], 1).gain(np.array([[1 / 40]]), np.zeros(1))
     assert (gain.chi2, gain.freedom) == (0.0, 0) and np.isnan(gain.sigma[0])
 

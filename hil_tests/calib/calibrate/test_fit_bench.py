@@ -331,7 +331,7 @@ def test_check_images_of_a_camera_share_the_error_of_its_calibration() -> None:
         )
         for k, pan_rad in enumerate((0.1, 0.1, 0.3))
     ]  # fmt: skip
-    block = ResidualBlock(np.zeros(4), np.full((4, 1), 10.0), np.arange(1), 2)  # in sigmas
+    block = ResidualBlock(np.zeros(4), np.full((4, 1), 10.0), np.arange(1))  # in sigmas
 
     by_pan = np.full((4, 20), 1e4) * (np.arange(20) == PAN_TILT[0])
     reads = Motions(block, by_pan, np.zeros((4, 4)))
