@@ -200,9 +200,10 @@ class Adjustment:
             prism_cad_m=self.prism_cad_m * factors.get(DRAWING, 1.0),
         )
 
-    def at_rest(self) -> Adjustment:
-        """Return the same problem without unknowns of single attitudes, for images that are not fitted."""
-        return self._copy(joint_rad=0.0)
+    def exact(self) -> Adjustment:
+        """Return the same problem for images that are not fitted: no unknowns of single attitudes, no bound
+        on pulls."""
+        return self._copy(joint_rad=0.0, huber=None)
 
     def _copy(self, **changed: object) -> Adjustment:
         other = object.__new__(type(self))

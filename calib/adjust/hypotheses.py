@@ -64,9 +64,9 @@ Rates = Callable[[ImageTerm, Motions], FloatArray]
 class Effect:
     """A measurement that a hypothesis concerns: of a picture, or of the station.
 
-    ``name`` is the picture's or placement's, ``group`` what changes only as a whole: a standstill, a
-    placement. ``block`` are its residuals (m,), ``rates`` (m, k) how they follow the numbers, ``moves_px``
-    (n, k) how its dots do, and ``elapsed`` which part of the pictures had been taken before, 0 to 1.
+    ``group`` is what changes only as a whole: a standstill, a placement. ``rates`` (m, k) are how residuals
+    follow the numbers, ``moves_px`` (n, k) how dots do, ``elapsed`` which part of the pictures had been taken
+    before, 0 to 1.
     """
 
     name: str
@@ -87,23 +87,14 @@ class Effect:
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
-    """Something that may be otherwise than a fit has it.
+    """Something that may be otherwise than a fit has it: what it concerns, and the sentence of a finding.
 
-    Attributes
-    ----------
-    name
-        ``mast``, ``harmonics of pan``, ``slip of tilt``, ``drift of tilt``, ``joint readings``,
-        ``lens of CAMERA``, ``change of CAMERA``, ``drift of CAMERA``, ``bow of the board``,
-        ``spacing of the board``, ``board moved``, ``placement P of BOARD`` or ``drawing`` (of the prisms).
-    subject
-        ``("joint", NAME)``, ``("camera", NAME)`` or ``("board", NAME, PLACEMENT)``, where it is one's.
-    rows
-        The measurements that it concerns, in the order in which they were taken.
-    sentence
-        What a finding of it says.
-    course
-        When it is so: ``always``, in one of the groups (``once``), in each by numbers of its own, or from
-        some group on.
+    ``name`` is ``mast``, ``harmonics of pan``, ``slip of tilt``, ``drift of tilt``, ``joint readings``,
+    ``lens of CAMERA``, ``change of CAMERA``, ``drift of CAMERA``, ``bow of the board``, ``spacing of the
+    board``, ``board moved``, ``placement P of BOARD`` or ``drawing`` (of the prisms); ``subject`` is
+    ``("joint", NAME)``, ``("camera", NAME)`` or ``("board", NAME, PLACEMENT)``, where it is one's. ``rows``
+    are in the order in which they were measured, and it is so ``always``, in one of their groups (``once``),
+    in ``each`` by numbers of its own, or ``from`` some group on.
     """
 
     name: str
@@ -123,26 +114,14 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """What a hypothesis would gain, at that of its pictures at which it gains most.
+    """What a hypothesis would gain, at that of its pictures at which it gains most, and what to do.
 
-    Attributes
-    ----------
-    name, subject, sentence
-        Of the hypothesis; what the finding says, and what to do.
-    values, sigma
-        (k,) of its numbers: radians (1) of a joint; a part of the focal length and a turn (4) of a camera;
-        turn and shift (6) of a board.
-    numbers, gain
-        How many numbers count, and by how much the sum of squares would fall.
-    chance
-        Of such a gain without any such effect, all tries counted.
-    size_px
-        By how much the numbers move the dots that depend on them, rms, pixels; not-a-number for what moves
-        points of the station.
-    before, after
-        Names of the pictures between which it changed; ``after`` alone where it is one's.
-    significant
-        Whether chance does not explain it, all hypotheses counted.
+    ``values`` and ``sigma`` (k,) are of its numbers: radians (1) of a joint; a part of the focal length and a
+    turn (4) of a camera; turn and shift (6) of a board; ``numbers`` is how many of them count. The sum of
+    squares would fall by ``gain``; ``chance`` is that of such a gain without any such effect, all tries
+    counted, and ``significant`` says whether it does not explain it, all hypotheses counted. The numbers move
+    the dots that depend on them by ``size_px``, rms; not-a-number for what moves points of the station. It
+    changed between the pictures ``before`` and ``after``, the latter alone where it is one's.
     """
 
     name: str
@@ -199,10 +178,8 @@ def find_contradictions(fit: ScoredFit) -> tuple[Finding, ...]:
 def _each_tested(fit: ScoredFit, hypotheses: Iterator[Hypothesis]) -> tuple[Finding, ...]:
     """What some hypotheses gain, their chances with all of them counted."""
     found = fit.findings(hypotheses)
-    chances = [min(1.0, len(found) * f.chance) for f in found]
-    found = [
-        replace(f, chance=one, significant=one < Level.STATED) for f, one in zip(found, chances, strict=True)
-    ]
+    found = [replace(f, chance=min(1.0, len(found) * f.chance)) for f in found]
+    found = [replace(f, significant=f.chance < Level.STATED) for f in found]
     return tuple(sorted(found, key=lambda f: (f.chance, -f.gain)))
 
 
@@ -224,9 +201,8 @@ def find_change(fit: ScoredFit) -> Finding | None:
     if what.subject[:1] != ("board",) and not (what.subject and explained):  # it is the model that is wrong
         return None
     found = fit.finding(what, at, gain, len(tried))
-    if found.chance > Level.CHANGED or (len(gain.values) > 1 and gain.chi2 < LEAST_PART * fit.chi2):
-        return None
-    return found
+    little = len(gain.values) > 1 and gain.chi2 < LEAST_PART * fit.chi2
+    return None if found.chance > Level.CHANGED or little else found
 
 
 class ScoredFit:

@@ -86,33 +86,18 @@ class CheckExpected(NamedTuple):
 class FittedRig:
     """A fitted rig and what is needed to judge it, whatever it was fitted to.
 
-    Attributes
-    ----------
-    parameter_names, covariance
-        (p,) and (p, p) of what was fitted of the mast, the joints and the cameras, as
-        ``mast.translation_m.x`` and ``cameras.navcam_left.H.x`` (``calib.geometry.covariance``); what was
-        fixed is exact. A and O of a camera have two each (``A.1``, ``A.2``): radians along
-        ``calib.geometry.rigid.tangents``.
-    sigma
-        Standard deviations under the mast file's keys: ``{"mast": {...}, "cameras": {name: {C: [3], ...}}}``.
-    rms_px, check_rms_px
-        Camera to (x, y) rms of what was fitted in images, and of check images, which were not; pixels.
-        Without images whose board, as it is named, the camera cannot see.
-    outliers, degenerate, notes
-        The measurements left out, the directions left open, and further facts for a person, a sentence each.
-    chi2, degrees_of_freedom, chi2_probability
-        Sum of squares of the residuals in stated sigmas, what it is expected to be, and the chance of a
-        larger one were all sigmas right; nan where the method does not weigh by them.
-    components
-        How large the errors of each kind of measurement are, against its stated sigma; empty where the method
-        does not weigh by them. The covariance is by what they were.
-    checks
-        Camera to what its check images are off by, and how likely it is that they are off by more.
-    rover_from_board
-        Poses by set-up, or board, and placement.
-    contradictions
-        Each placement tested against the others, the least likely first; empty where the method does not
-        weigh by sigmas.
+    ``parameter_names`` (p,) and ``covariance`` (p, p) are of what was fitted of the mast, the joints and the
+    cameras, as ``mast.translation_m.x`` and ``cameras.navcam_left.H.x`` (``calib.geometry.covariance``); what
+    was fixed is exact. A and O of a camera have two each (``A.1``, ``A.2``): radians along
+    ``calib.geometry.rigid.tangents``. ``sigma`` are standard deviations under the mast file's keys:
+    ``{"mast": {...}, "cameras": {name: {C: [3], ...}}}``. ``rms_px`` and ``check_rms_px`` are by camera the
+    (x, y) rms of what was fitted in images, and of check images, which were not; without images whose board,
+    as it is named, the camera cannot see. ``chi2`` is the sum of squares of the residuals in stated sigmas,
+    ``degrees_of_freedom`` what it is expected to be, ``chi2_probability`` the chance of a larger one were all
+    sigmas right; nan where the method does not weigh by them. ``components`` are how large the errors of each
+    kind of measurement are against its stated sigma, ``contradictions`` each placement tested against the
+    others, the least likely first; both are empty where the method does not weigh. The covariance is by what
+    the sigmas were found to be. ``rover_from_board`` is by set-up, or board, and placement.
     """
 
     rig: Rig
@@ -147,16 +132,10 @@ class FittedRig:
 class Calibration(FittedRig):
     """A rig fitted to a survey.
 
-    Attributes
-    ----------
-    estimate
-        (p,) values of the parameters; 0 for the two of an A or O, which count from the rig's own.
-    wider
-        The gain of further numbers, the likeliest first; empty where the method does not weigh by sigmas.
-    prisms_in_rover_m
-        Refined where the CAD has a sigma.
-    unseen_clicks
-        Check clicks on points that their camera, as fitted, cannot see.
+    ``estimate`` (p,) are the values of the parameters; 0 for the two of an A or O, which count from the rig's
+    own. ``wider`` is the gain of further numbers, the likeliest first; empty where the method does not weigh.
+    ``prisms_in_rover_m`` are refined where the CAD has a sigma. ``unseen_clicks`` are check clicks on points
+    that their camera, as fitted, cannot see.
     """
 
     method: Literal["paper", "joint"]
@@ -173,18 +152,11 @@ class Calibration(FittedRig):
 class BenchCalibration(FittedRig):
     """A rig fitted to pictures of boards that stood anywhere.
 
-    Attributes
-    ----------
-    gauges
-        Quantities that pictures cannot determine, and how they were fixed, a sentence each.
-    drifts
-        How far each joint and each camera drifts, the least likely first.
-    joint_rad
-        The error of one joint reading, besides its joint's errors.
-    inexact_m
-        How far corners are printed beside their places, as all pictures show it alike; 0 if none do.
-    bows_m
-        By board its bow (across, down), metres.
+    ``gauges`` are quantities that pictures cannot determine, and how they were fixed, a sentence each.
+    ``drifts`` say how far each joint and each camera drifts, the least likely first. ``joint_rad`` is the
+    error of one joint reading, besides its joint's errors, ``inexact_m`` how far corners are printed beside
+    their places, as all pictures show it alike (0 if none do), ``bows_m`` by board its bow (across, down),
+    metres.
     """
 
     terms: tuple[TermGain, ...]

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -24,13 +25,9 @@ MADE_UP = 1e-7
 """A further number is made up for by those that were fitted if so little of its information is left."""
 
 
-@dataclass(frozen=True, eq=False)
-class Gain:
-    """The gain of further numbers.
-
-    ``chi2`` by how much the sum of squares would fall, ``freedom`` how many of the numbers count, ``values``
-    (k,) of each number and ``sigma`` (k,), not-a-number where it cannot be determined by itself.
-    """
+class Gain(NamedTuple):
+    """By how much the sum of squares would fall, how many of the further numbers count, their values (k,) and
+    sigmas (k,), not-a-number where one cannot be determined by itself."""
 
     chi2: float
     freedom: int

@@ -54,8 +54,7 @@ class LeastSquaresProblem(Protocol[State]):
 
 @dataclass(frozen=True, eq=False)
 class Minimum(Generic[State]):
-    """Where a fit ended: its state, the normal equations there, whether it settled within its steps, and what
-    was added to their diagonal."""
+    """Where a fit ended: its state, the normal equations there, and what was added to their diagonal."""
 
     state: State
     normal: Normal
@@ -97,16 +96,20 @@ def minimise(
         while moved is None and damping <= LARGEST_DAMPING:
             try:
                 step, expected = _step(scaled, scaled_gradient, damping)
-                nothing_left = expected <= least
-                if (
-                    nothing_left and damping > FIRST_DAMPING
-                ):  # or is it the damping that keeps the step short?
-                    nothing_left = _step(scaled, scaled_gradient, FIRST_DAMPING)[1] <= least
+                # Or is it the damping that keeps the step short?
+                nothing_left = expected <= least and (
+                    damping <= FIRST_DAMPING or _step(scaled, scaled_gradient, FIRST_DAMPING)[1] <= least
+                )
             except np.linalg.LinAlgError:
                 damping = max(10 * damping, 1e-12)
                 continue
-            tried = _try(problem, state, scale * step, normal.cost)
-            moved, cost = tried
+            cost = np.inf
+            try:
+                moved = problem.stepped(state, scale * step)
+                cost = problem.cost(moved)
+            except ValueError:
+                pass
+            moved = moved if cost < normal.cost else None
             if nothing_left:
                 if moved is not None:
                     state, normal = moved, problem.normal(moved)
@@ -137,18 +140,6 @@ def _step(matrix: FloatArray, gradient: FloatArray, damping: float) -> tuple[Flo
     factor = cho_factor(matrix + damping * np.eye(len(gradient)), check_finite=False)
     step = -cho_solve(factor, gradient, check_finite=False)
     return step, float(-step @ (2 * gradient + matrix @ step))
-
-
-def _try(
-    problem: LeastSquaresProblem[State], state: State, step: FloatArray, cost: float
-) -> tuple[State | None, float]:
-    """The state a step leads to, or None if that is no better; and its cost."""
-    try:
-        moved = problem.stepped(state, step)
-    except ValueError:
-        return None, float("inf")
-    reached = problem.cost(moved)
-    return (moved if reached < cost else None), reached
 
 
 def covariance_of(matrix: FloatArray, weak: FloatArray | None = None) -> FloatArray:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from calib.adjust.adjustment import Adjustment
-from calib.adjust.checks import expected_checks
+from calib.adjust.adjustment import PAN_TILT, Adjustment
 from calib.adjust.result import (
     Calibration,
+    CheckExpected,
     Degenerate,
     FittedRig,
     ImageResiduals,
@@ -24,10 +24,21 @@ from calib.geometry.covariance import landing_rates, pixel_rates
 from calib.geometry.parameters import parameter_names, parameter_part
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, tangents
-from calib.geometry.significance import Level
+from calib.geometry.significance import Level, chance_of_sum, rare_sum
 from calib.survey.records import Click, Survey
 
-Rms = dict[str, tuple[float, float]]
+OPEN = 0.05
+"""A direction is open if the data leave more than this part of how far it could be off at all (1 m, 1 rad,
+one focal length)."""
+
+SEEN_RAD = 0.05
+"""A joint that moves less than this between the fitted images is called still."""
+
+PART = 0.25
+"""A parameter is named if it makes up at least this part of an open direction; the mast's a third of it."""
+
+USUAL = ("O", "R", "E", "D")
+"""Numbers of a camera of which what lenses are usually like decides, however little the data show of them."""
 
 
 def image_residuals(
@@ -48,9 +59,12 @@ def image_residuals(
     found = []
     for term, off in zip(terms, problem.residuals(state, terms), strict=True):
         image = by_name[term.name]
-        keep = used.get(term.name)
-        residual = off.reshape(-1, 2) * term.sigma_px[:, None]
-        centre, facing = _seen_from(problem, state, term)
+        board, seen_from = state.rover_from_board[term.board], state.cameras[term.camera].C
+        if term.attitude is not None:
+            head = problem.head(state, [term])
+            seen_from = head.rotation[0] @ seen_from + head.translation_m[0]
+        towards = board.translation_m - seen_from
+        range_m = float(np.linalg.norm(towards))
         found.append(
             ImageResiduals(
                 term.name,
@@ -63,11 +77,11 @@ def image_residuals(
                 term.rows,
                 term.columns,
                 term.pixels_px,
-                residual,
+                off.reshape(-1, 2) * term.sigma_px[:, None],
                 term.sigma_px,
-                np.zeros(len(residual), dtype=bool) if keep is None else keep,
-                float(np.linalg.norm(centre)),
-                float(np.arccos(np.clip(abs(facing @ centre) / np.linalg.norm(centre), 0.0, 1.0))),
+                used.get(term.name, np.zeros(len(term.keep), dtype=bool)),
+                range_m,
+                float(np.arccos(np.clip(abs(board.rotation[:, 2] @ towards) / range_m, 0.0, 1.0))),
                 (scatter or {}).get(term.name, 1.0),
             )
         )
@@ -95,14 +109,16 @@ def fitted_fields(
     numbers = problem.of_kinds(*kinds)
     of_rig = widened * covariance[np.ix_(numbers, numbers)]
     sigma = sigma_by_key(rig, names, of_rig)
+    unfitted = [(i.camera, i.residuals_px) for i in images if i.purpose == "check"]
+    unfitted += [(camera, off) for _, camera, off in _check_clicks(survey, state)]
     return {
         "rig": rig,
         "parameter_names": names,
         "covariance": of_rig,
         "sigma": sigma,
-        "rms_px": _rms((i.camera, i.residuals_px[i.used]) for i in images if i.used.any()),
-        "check_rms_px": check_rms(survey, state, images),
-        "checks": expected_checks(problem, state, covariance, checks, images, level),
+        "rms_px": _rms((i.camera, i.residuals_px[i.used]) for i in images),
+        "check_rms_px": _rms((camera, off[np.isfinite(off).all(axis=1)]) for camera, off in unfitted),
+        "checks": _expected_checks(problem, state, covariance, checks, images, level),
         "images": images,
         "notes": (*notes, *lens_notes(rig, sigma)),
         "rover_from_board": state.rover_from_board,
@@ -111,39 +127,25 @@ def fitted_fields(
 
 def station_fields(survey: Survey, problem: Adjustment, state: Estimate) -> dict[str, Any]:
     """Return the fields of a `Calibration` that a survey has beyond those of a fitted rig."""
+    station = tuple(
+        StationResidual(
+            "prism" if p.board is None else "tape",
+            p.setup,
+            "" if p.board is None else p.board[1],
+            p.point,
+            off * p.sigma_m,
+            p.keep,
+        )
+        for p, off in zip(problem.station, problem.residuals(state, problem.station), strict=True)
+    )
+    clicks = _check_clicks(survey, state)
     return {
         "estimate": np.array(list(problem.values(state, "mast", "camera").values())),
-        "unseen_clicks": unseen_clicks(survey, state),
-        "station": station_residuals(problem, state),
+        "unseen_clicks": tuple(click for click, _, off in clicks if not np.isfinite(off).all()),
+        "station": station,
         "rover_from_station": state.rover_from_station,
         "prisms_in_rover_m": state.prisms_in_rover_m,
     }
-
-
-def _seen_from(problem: Adjustment, state: Estimate, term: ImageTerm) -> tuple[FloatArray, FloatArray]:
-    """The board's centre from the camera's C, and its normal; rover-frame directions."""
-    board = state.rover_from_board[term.board]
-    centre = state.cameras[term.camera].C
-    if term.attitude is not None:
-        head = problem.head(state, [term])
-        centre = head.rotation[0] @ centre + head.translation_m[0]
-    return board.translation_m - centre, board.rotation[:, 2]
-
-
-def check_rms(survey: Survey, state: Estimate, images: Iterable[ImageResiduals]) -> Rms:
-    """Return the (x, y) rms over check images and clicks of each camera, pixels: none was fitted.
-
-    What has no pixel does not count.
-    """
-    parts = [(i.camera, i.residuals_px) for i in images if i.purpose == "check"]
-    parts += [(camera, off) for _, camera, off in _check_clicks(survey, state)]
-    seen = [(camera, off[np.isfinite(off).all(axis=1)]) for camera, off in parts]
-    return _rms((camera, off) for camera, off in seen if len(off))
-
-
-def unseen_clicks(survey: Survey, state: Estimate) -> tuple[Click, ...]:
-    """Return the check clicks on points that their camera, as fitted, cannot see; no rms has them."""
-    return tuple(click for click, _, off in _check_clicks(survey, state) if not np.isfinite(off).all())
 
 
 def _check_clicks(survey: Survey, state: Estimate) -> Iterator[tuple[Click, str, FloatArray]]:
@@ -160,11 +162,12 @@ def _check_clicks(survey: Survey, state: Estimate) -> Iterator[tuple[Click, str,
         yield click, image.camera, np.where(valid[:, None], pixel, np.nan) - click.pixel_px
 
 
-def _rms(parts: Iterable[tuple[str, FloatArray]]) -> Rms:
-    """Collect residuals by camera."""
+def _rms(parts: Iterable[tuple[str, FloatArray]]) -> dict[str, tuple[float, float]]:
+    """The (x, y) rms of residuals (n, 2) by camera, of those that have any."""
     collected: dict[str, list[FloatArray]] = {}
     for camera, residual in parts:
-        collected.setdefault(camera, []).append(residual)
+        if len(residual):
+            collected.setdefault(camera, []).append(residual)
     rms = {}
     for camera, residuals in collected.items():
         x, y = np.sqrt(np.mean(np.concatenate(residuals) ** 2, axis=0))
@@ -172,32 +175,68 @@ def _rms(parts: Iterable[tuple[str, FloatArray]]) -> Rms:
     return rms
 
 
-def station_residuals(problem: Adjustment, state: Estimate) -> tuple[StationResidual, ...]:
-    """Return what remains of every prism and tape, metres in the rover frame."""
-    return tuple(
-        StationResidual(
-            "prism" if p.board is None else "tape",
-            p.setup,
-            "" if p.board is None else p.board[1],
-            p.point,
-            off * p.sigma_m,
-            p.keep,
+def _expected_checks(
+    problem: Adjustment,
+    state: Estimate,
+    covariance: FloatArray,
+    checks: Sequence[ImageTerm],
+    residuals: Sequence[ImageResiduals],
+    level: Level,
+) -> dict[str, CheckExpected]:
+    """By camera what its check images are off by, and should be: their noise and the error of their
+    prediction. Dots that have no pixel do not count; the largest allowed size is passed with the chance
+    ``level``.
+    """
+    off_px = {image.name: image.residuals_px for image in residuals}
+    terms = [replace(t, keep=np.asarray(np.isfinite(off_px[t.name]).all(axis=1))) for t in checks]
+    terms = [t for t in terms if t.keep.any()]
+    expected = {}
+    for camera in dict.fromkeys(t.camera for t in terms):
+        mine = [t for t in terms if t.camera == camera]
+        weights = check_weights(problem, state, covariance, mine)
+        off = np.concatenate([off_px[t.name][t.keep] for t in mine])
+        expected[camera] = CheckExpected(
+            float(np.sqrt(np.mean(off**2))),
+            float(np.sqrt(weights.mean())),
+            float(np.sqrt(rare_sum(level, weights) / len(weights))),
+            chance_of_sum(float(np.sum(off**2)), weights),
         )
-        for p, off in zip(problem.station, problem.residuals(state, problem.station), strict=True)
-    )
+    return expected
 
 
-OPEN = 0.05
-"""A direction is open if the data leave more than this part of how far it could be off at all (1 m, 1 rad,
-one focal length)."""
+def check_weights(
+    problem: Adjustment, state: Estimate, covariance: FloatArray, terms: Sequence[ImageTerm]
+) -> FloatArray:
+    """Return what the squares of independent unit errors count in the sum of squares of a camera's check
+    images, (m,), px², that have m numbers in all.
 
-USUAL = ("O", "R", "E", "D")
-
-SEEN_RAD = 0.05
-"""A joint that moves less than this between the fitted images is called still."""
-
-PART = 0.25
-"""A parameter is named if it makes up at least this part of an open direction; the mast's a third of it."""
+    All of them hang on one calibration and share its error; those of one board share that of its tapes, those
+    of one standstill that of its reading. So the distribution of that sum is known
+    (`calib.geometry.significance.chance_of_sum`).
+    """
+    exact = problem.exact()
+    standstills = list(dict.fromkeys((t.pan_rad, t.tilt_rad, t.approach) for t in terms))
+    by_all, by_readings, own_px = [], [], []
+    for term, motions in zip(terms, exact.motions(state, terms), strict=True):
+        sigma_px = np.repeat(term.sigma_px[term.keep], 2)[:, None]
+        rates = np.zeros((len(sigma_px), len(covariance)))
+        rates[:, motions.block.columns] = sigma_px * motions.block.jacobian
+        readings = np.zeros((len(sigma_px), len(standstills), 2))
+        if term.attitude is not None and problem.joint_rad > 0:
+            at = standstills.index((term.pan_rad, term.tilt_rad, term.approach))
+            readings[:, at] = sigma_px * problem.joint_rad * motions.head[:, PAN_TILT]
+        by_all.append(rates)
+        by_readings.append(readings.reshape(len(rates), -1))
+        own_px.append(sigma_px)
+    rates = np.concatenate(by_all)
+    touched = rates.any(axis=0)
+    values, vectors = np.linalg.eigh(covariance[np.ix_(touched, touched)])
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    shared = np.hstack([rates[:, touched] @ root, np.concatenate(by_readings)])
+    together = np.linalg.svd(shared, compute_uv=False) ** 2
+    weights = np.sort(np.concatenate(own_px)[:, 0] ** 2)[::-1]
+    weights[: len(together)] += together
+    return weights
 
 
 def sigma_by_key(rig: Rig, names: Sequence[str], covariance: FloatArray) -> dict[str, Any]:
@@ -296,7 +335,6 @@ def open_directions(problem: Adjustment, covariance: FloatArray) -> tuple[Degene
 
     ``covariance`` (p, p) is of all the problem's numbers, with its weak knowledge added.
     """
-    # What lenses are usually like decides of their O, R, E and D, however little the data show of them.
     shown = [i for i in problem.of_kinds("camera", "mast") if problem.names[i].split(".")[-2] not in USUAL]
     names = [problem.names[i] for i in shown]
     found = open_parameters(names, covariance[np.ix_(shown, shown)], problem.weak[shown])

@@ -13,12 +13,11 @@ import pytest
 
 from calib.adjust import hypotheses
 from calib.adjust.adjustment import PAN_TILT, Motions
-from calib.adjust.checks import check_weights
 from calib.adjust.hypotheses import Finding, ScoredFit, find_drifts
 from calib.adjust.model_terms import candidate_terms, entering_together
 from calib.adjust.result import BenchCalibration
 from calib.adjust.terms import ImageTerm
-from calib.adjust.uncertainty import pixel_covariance
+from calib.adjust.uncertainty import check_weights, pixel_covariance
 from calib.adjust.unknowns import ResidualBlock
 from calib.calibrate import bench
 from calib.calibrate.bench import BenchProblem, fit_bench
@@ -336,9 +335,7 @@ def test_check_images_of_a_camera_share_the_error_of_its_calibration() -> None:
     by_pan = np.full((4, 20), 1e4) * (np.arange(20) == PAN_TILT[0])
     reads = Motions(block, by_pan, np.zeros((4, 4)))
     exact = SimpleNamespace(motions=lambda state, terms: [reads] * len(terms))
-    problem: Any = SimpleNamespace(
-        with_huber=lambda huber: SimpleNamespace(at_rest=lambda: exact), joint_rad=0.002
-    )
+    problem: Any = SimpleNamespace(exact=lambda: exact, joint_rad=0.002)
     state: Any = None
     shared = np.array([[0.5, 2.0, 0.0]] * 8 + [[0.5, 0.0, 2.0]] * 4)
     expected = np.sort(np.full(12, 0.01) + np.append(np.zeros(9), np.linalg.eigvalsh(shared.T @ shared)))
