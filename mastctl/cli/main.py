@@ -56,7 +56,7 @@ OVERVIEW: Mapping[str, Mapping[str, tuple[str, str]]] = {
     },
     "a rig of your own": {
         "rig": (
-            "rig requests servos sim sentinel",
+            "rig requests servos sentinel",
             "write a rig's files; its servos, lease, tokens, mast file, drift",
         ),
         "schema": ("rig", "print the JSON Schema of a file that people write"),

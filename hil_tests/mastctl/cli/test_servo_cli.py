@@ -82,10 +82,10 @@ def test_info_tells_every_register_in_numbers_and_words(
         measured = name.startswith(("present_", "realtime", "moving")) or name.endswith("trajectory")
         if known is not None and not measured:
             assert value == known, name
-    assert told["words"]["operating_mode"] == "position"
-    assert told["words"]["baud"] == "1000000 baud"
-    assert told["words"]["profile_velocity"] == "as fast as it can"
-    assert told["words"]["present_voltage"] == "12.0 V"
+    assert told["meanings"]["operating_mode"] == "position"
+    assert told["meanings"]["baud"] == "1000000 baud"
+    assert told["meanings"]["profile_velocity"] == "as fast as it can"
+    assert told["meanings"]["present_voltage"] == "12.0 V"
     code, out, _ = run(capsys, "info", bench.line.path, "2", "--baud", BAUD)
     assert code == 0
     assert "PH42-020-S300" in out
