@@ -55,7 +55,7 @@ def name_schema(file: Path, kind: str) -> Path:
     BadFile
         If the file system refuses.
     """
-    from calib.files.atomic import replace_bytes
+    from calib.files import replace_bytes
 
     schema = file.parent / SCHEMAS / f"{kind}.json"
     schema.parent.mkdir(exist_ok=True)

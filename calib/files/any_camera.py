@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.errors import BadFile
-from calib.files import UNKNOWN_FRAME, CameraFile, read_bytes
-from calib.files.atomic import save_bytes
+from calib.files import UNKNOWN_FRAME, CameraFile, read_bytes, save_bytes
 from calib.files.cahvor_text import format_cahvor, internal_parameters, looks_like_cahvor, parse_cahvor
 from calib.files.mast_file import CAMERA_SCHEMA, StoredRig, parse_camera, parse_rig, save_camera
 from calib.files.mrcal_kalibr import (

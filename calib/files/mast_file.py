@@ -2,7 +2,7 @@
 
 Contract section 2. A and O are normalised on load; a note says so when that moves a pixel by more than
 0.01. The digest of a file is the SHA-256 of its bytes. The version before a save is kept as
-``NAME.previous.yaml`` (see `calib.files.atomic`).
+``NAME.previous.yaml`` (see `calib.files`).
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from calib.files import (
     build_model,
     digest_of,
     read_bytes,
+    save_bytes,
 )
-from calib.files.atomic import save_bytes
 from calib.files.records import ABSENT, Free, Number, Pair, Record, Text, Vector, parse_record, problem, when
 from calib.files.yaml_text import MAX_BYTES, dump_mapping, kind_of
 from calib.geometry.cahvor import COEFFICIENTS, FREE, KINDS, CameraModel, Kind

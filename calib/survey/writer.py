@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.errors import BadFile
-from calib.files.atomic import replace_bytes, sync_folder, write_new
+from calib.files import replace_bytes, sync_folder, write_new
 from calib.files.mast_file import sensor_mode_keys
 from calib.files.tables import write_rows
 from calib.files.yaml_text import dump_mapping, plain

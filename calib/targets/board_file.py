@@ -21,8 +21,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, RootModel, model_validator
 
-from calib.files import read_bytes
-from calib.files.atomic import save_bytes
+from calib.files import read_bytes, save_bytes
 from calib.files.records import ABSENT, Record, Text, parse_record, problem, read_record
 from calib.files.yaml_text import MAX_BYTES, dump_mapping, kind_of, parse_mapping
 from calib.targets.boards import AnyBoard, AprilGrid, Charuco, Checkerboard, DotBoard

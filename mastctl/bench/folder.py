@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from calib.errors import BadFile
-from calib.files.atomic import replace_bytes
+from calib.files import replace_bytes
 from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
 from calib.plan.placements import Placement

@@ -19,8 +19,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from calib.errors import BadFile
-from calib.files import read_bytes
-from calib.files.atomic import replace_bytes
+from calib.files import read_bytes, replace_bytes
 from calib.targets.board_file import parse_board
 from calib.targets.boards import AnyBoard
 from mastctl.answers import BenchRunRecord, BenchSummary

@@ -15,7 +15,7 @@ import numpy as np
 from calib.adjust.hypotheses import Finding
 from calib.adjust.result import BenchCalibration, Calibration
 from calib.adjust.uncertainty import sigma_by_key
-from calib.files.atomic import keep_previous, previous_path
+from calib.files import keep_previous, previous_path
 from calib.files.mast_file import StoredRig, save_rig
 from calib.files.yaml_text import plain
 from calib.geometry.covariance import RigCovariance

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib.adjust.result import HELD_FIXED, BenchCalibration, Calibration, FittedRig
-from calib.files.atomic import save_bytes
+from calib.files import save_bytes
 from calib.files.mast_file import StoredRig
 from calib.geometry.rig import Rig
 from calib.survey.records import Survey

@@ -48,7 +48,7 @@ OPTIONS_OF = {
     example="--kind charuco --paper A4 --out board.pdf",
 )
 def _make(args: argparse.Namespace) -> Answer:
-    from calib.files.atomic import save_bytes
+    from calib.files import save_bytes
     from calib.targets.board_file import save_board
     from mastctl.setup.board_sheet import pdf_of, sheet_of, svg_of
 
@@ -98,7 +98,7 @@ def _measured(args: argparse.Namespace) -> Answer:
 def _find(args: argparse.Namespace) -> Answer:
     import numpy as np
 
-    from calib.files.atomic import save_bytes
+    from calib.files import save_bytes
     from calib.files.pictures import decode_picture
     from calib.targets.board_file import load_board
     from calib.targets.boards import CornersNotFound

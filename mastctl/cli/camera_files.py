@@ -243,7 +243,7 @@ def _save_maps(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
     import numpy as np
 
-    from calib.files.atomic import save_bytes
+    from calib.files import save_bytes
 
     archive = io.BytesIO()
     np.savez_compressed(archive, **arrays)  # type: ignore[arg-type]  # names are names

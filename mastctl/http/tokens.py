@@ -20,7 +20,7 @@ from typing import Annotated
 from pydantic import Field
 
 from calib.errors import BadFile
-from calib.files.atomic import remove, replace_bytes
+from calib.files import remove, replace_bytes
 from calib.files.records import Record, read_value
 from mastctl.answers import Role
 from mastctl.control.lease import ROLES

@@ -21,7 +21,7 @@ from typing import Any
 from google.protobuf.message import Message
 from mcap.writer import CompressionType, Writer
 
-from calib.files.atomic import sync_folder
+from calib.files import sync_folder
 from mastctl.as_json import writable
 from mastctl.recorder.schemas import encodings
 

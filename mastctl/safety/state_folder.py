@@ -100,7 +100,7 @@ class StateFile:
         Raises BadFile if the file system refuses; what is then read is the former document, or the new one if
         only its way to the disk was not confirmed.
         """
-        from calib.files.atomic import replace_bytes
+        from calib.files import replace_bytes
 
         with self._refused("saved"):
             replace_bytes(self.path, self._data(document).ljust(self.room), self.mode)
@@ -111,14 +111,14 @@ class StateFile:
         A crash meanwhile may leave a file that cannot be read: only for what then counts as this document.
         Raises as `write`, and BadFile if there is no file with room for it.
         """
-        from calib.files.atomic import overwrite_bytes
+        from calib.files import overwrite_bytes
 
         with self._refused("overwritten"):
             overwrite_bytes(self.path, self._data(document))
 
     def remove(self) -> None:
         """Remove the file; when this returns it is gone from the disk too. Raises BadFile."""
-        from calib.files.atomic import remove
+        from calib.files import remove
 
         with self._refused("removed"):
             remove(self.path)

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.files.atomic import save_bytes
+from calib.files import save_bytes
 from calib.files.mast_file import MAST_SCHEMA, load_rig
 from calib.files.yaml_text import dump_mapping
 from drivers.faults import PAN_TILT

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.files.atomic import save_bytes
+from calib.files import save_bytes
 from calib.files.mast_file import load_rig, save_rig
 from calib.files.yaml_text import dump_mapping
 from calib.geometry.cahvor import CameraModel

@@ -13,7 +13,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
 from calib.errors import BadFile
-from calib.files.atomic import replace_bytes
+from calib.files import replace_bytes
 from drivers.clock import Clock, SystemClock
 from mastctl.control.machine import StandingFault
 from mastctl.json_lines import OtherFile, append_line, read_lines

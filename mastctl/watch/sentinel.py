@@ -20,8 +20,7 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from calib.calibrate.drift import SceneDrift
 from calib.errors import BadFile
-from calib.files import read_bytes
-from calib.files.atomic import replace_bytes
+from calib.files import read_bytes, replace_bytes
 from calib.files.records import Moment, Record, Text, problem, read_record
 from calib.matching.warp import Grey, grey
 from mastctl.answers import SentinelTold

@@ -18,9 +18,8 @@ import pytest
 import yaml
 
 from calib.errors import BadFile
-from calib.files import CameraFile
+from calib.files import CameraFile, keep_previous, previous_path, save_bytes
 from calib.files import mast_file as store
-from calib.files.atomic import keep_previous, previous_path, save_bytes
 from calib.files.yaml_text import parse_mapping
 from calib.geometry.covariance import moved_rig, stored_covariance
 from calib.geometry.mode import SensorMode

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from calib.errors import BadFile
-from calib.files.atomic import save_bytes
+from calib.files import save_bytes
 from hil_tests.mastctl.safety.crash_states import Recorder, crash_states
 from mastctl.safety.state_folder import StateFile
 

@@ -14,7 +14,7 @@ import jsonschema_rs
 import pytest
 
 from calib.errors import BadFile
-from calib.files.atomic import save_bytes
+from calib.files import save_bytes
 from calib.files.mast_file import load_rig
 from calib.files.yaml_text import parse_mapping
 from drivers.dynamixel.settings import dynamixel_settings
