@@ -31,11 +31,9 @@ from drivers.hardware import Hardware
 from mastctl import signals
 from mastctl.config import Config, Listen
 from mastctl.errors import MastctlError, Unable
-from mastctl.http.access import Access
-from mastctl.http.entrance import EntryRules, HostNames
-from mastctl.http.silent import Listener, SilentConnections
-from mastctl.http.tokens import TokenList
-from mastctl.http.waiting import Streams, Waiting
+from mastctl.http.guard import EntryRules
+from mastctl.http.tokens import Access, TokenList
+from mastctl.http.waiting import Listener, SilentConnections, Streams, Waiting
 from mastctl.logs import stall_while
 from mastctl.safety.state_folder import StateFolder
 from mastctl.safety.stop_socket import StopsHang
@@ -307,7 +305,7 @@ async def _reread_tokens(access: Access, waiting: Waiting, streams: Streams) -> 
         while True:
             await asyncio.sleep(REREAD_S)
             await waiting.run(access.reread)
-            streams.end_revoked(access.stands)
+            streams.end_revoked(access.is_valid)
 
 
 async def _report_state(service: Service, manager: ServiceManager) -> None:
@@ -344,18 +342,17 @@ def _settings(app: ASGIApp) -> uvicorn.Config:
 def _entry_rules(service: Service, url: str) -> EntryRules:
     """Return the rules for clients, by the address that the daemon listens at. Raises BadFile."""
     listen = service.config.listen
-    names = HostNames(frozenset(listen.hosts), any_address=listen.needs_token)
     service.bench.serve(url)
     if not listen.needs_token:
-        return EntryRules(names, None, "loopback" if listen.socket is None else "unix")
+        return EntryRules(via="loopback" if listen.socket is None else "unix")
     tokens = TokenList(service.folder.path)
     access = Access(tokens)
-    service.bench.serve(url, access.lend)
-    service.leases.stands = access.stands
+    service.bench.serve(url, access.temporary)
+    service.leases.token_is_valid = access.is_valid
     log.warning("%s requires a token, except for a stop; the tokens are in %s", url, tokens.folder)
     if listen.socket is None:
         log.warning("%s speaks plain HTTP: others can read tokens and images unless a proxy encrypts", url)
-    return EntryRules(names, access, "token")
+    return EntryRules(frozenset(listen.hosts), True, access, "token")
 
 
 def _suspend(service: Service) -> None:

@@ -149,7 +149,7 @@ class LeaseTable:
     ``on_change``: gets the client that steers after each change. ``stop``: stops what runs; gets the reason.
     Called without the lock.
 
-    ``stands``: whether a token is still valid, by its digest; called with the lock kept, from any thread.
+    ``token_is_valid``: of a token's digest; called with the lock kept, from any thread.
     """
 
     def __init__(
@@ -163,7 +163,7 @@ class LeaseTable:
         self._running = running
         self._on_change = on_change
         self._stop = stop
-        self.stands: Callable[[str], bool] = lambda credential: True
+        self.token_is_valid: Callable[[str], bool] = lambda credential: True
         self._last_stop = StopCame()
         self._lock = threading.Lock()
         self._lease: Lease | None = None
@@ -358,7 +358,7 @@ class LeaseTable:
             return f"the lease was not renewed for {lease.for_s:g} s"
         if self.was_stopped(lease):
             return self._last_stop.how
-        if lease.credential and not self.stands(lease.credential):
+        if lease.credential and not self.token_is_valid(lease.credential):
             return "the token that it was granted to has ended"
         return ""
 

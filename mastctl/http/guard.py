@@ -1,26 +1,33 @@
 """Checks before the API: the page's origin, the caller, how much is sent, and whether that is JSON.
 
-A stop passes nearly all of them: only another site's page is refused one. Empty parts of its address (a slash
-too many) do not matter; everything else has one address.
+Every web page that a browser has open can send requests to whatever the browser's machine reaches. A foreign
+name in Host means that another site's name resolves to this daemon (DNS rebinding). A foreign Origin or
+Sec-Fetch-Site means that the request is of another site's page.
+
+A stop passes nearly all of the checks: only another site's page is refused one. Empty parts of its address (a
+slash too many) do not matter; everything else has one address.
 """
 
 from __future__ import annotations
 
+import ipaddress
 import json
 import logging
 import math
 import sys
 from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
 from typing import Any, NoReturn, Protocol
-from urllib.parse import parse_qsl
+from urllib.parse import parse_qsl, urlsplit
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from mastctl.control.lease import Caller
-from mastctl.errors import BadRequest, MastctlError, NotAllowed, one_line
+from mastctl.config import is_loopback
+from mastctl.control.lease import NETWORK, Caller, client_name
+from mastctl.errors import BadRequest, MastctlError, NotAllowed, NotLetIn, one_line
 from mastctl.http import PREFIX
-from mastctl.http.entrance import EntryRules, changes, check_site, shown_token
 from mastctl.http.refusals import BadHttp, marked, refusal_response
+from mastctl.http.tokens import Access, Token
 
 log = logging.getLogger(__name__)
 
@@ -37,39 +44,190 @@ FILES = ("/page/", SITE)
 """Before the name of each file of the page and of the documentation: no data, so no token is required."""
 LARGEST_BODY_BYTES = 65536
 ATTACKS = frozenset({"wrong_token", "foreign_host", "foreign_origin"})
-"""Refusals that are recorded of reading too; of what changes something each one is."""
+"""Refusals that are recorded of reading too; of requests that change something each one is."""
+SCHEME = "bearer "
+SCHEMES = ("http", "https")
+"""Of a page of the daemon's own; https by a reverse proxy."""
+FORWARDED = ("forwarded", "via", "x-real-ip", "x-client-ip", "true-client-ip", "cf-connecting-ip")
+"""Headers by which a proxy states that a request came from elsewhere, beside all of ``X-Forwarded-...``."""
 
 _SECRETS = frozenset({"token", "access_token", "authorization", "api_key", "apikey"})
 
 
+@dataclass
+class EntryRules:
+    """A daemon's rules for its clients.
+
+    It answers to loopback names and to ``hosts``, in lower case; with ``any_address`` to any IP address too,
+    which no name server can point elsewhere. Without ``access`` every client that reaches it may do
+    everything, ``via`` this machine's ``loopback`` address under loopback names, or a ``unix`` socket.
+    """
+
+    hosts: frozenset[str] = frozenset()
+    any_address: bool = False
+    access: Access | None = None
+    via: str = "loopback"
+
+    def check_host(self, headers: Mapping[str, str]) -> None:
+        """Pass a request for one of these names. Raises NotAllowed ``foreign_host``."""
+        host = headers.get("host", "")
+        name = _url_parts(f"//{host}").hostname or ""
+        if is_loopback(name) or name in self.hosts or (self.any_address and _is_address(name)):
+            return
+        known = ", ".join(sorted(self.hosts)) or "a loopback name such as 127.0.0.1"
+        expected = f"{known} is expected (listen.hosts of the configuration)"
+        raise NotAllowed("foreign_host", f"Host is '{_shown(host)}' where {expected}")
+
+    def caller(self, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
+        """Return the caller of a request.
+
+        Raises NotLetIn ``no_token``, ``wrong_token``, NotAllowed ``foreign_origin`` for a page's cookie
+        without an Origin where something is changed.
+        """
+        if self.access is None:
+            if by := forwarded(headers):
+                reason = f"{by.title()} shows that the request came through a proxy"
+                remedy = "set listen.hosts, so that clients need one"
+                raise NotLetIn("no_token", f"{reason}, and this daemon has no tokens: {remedy}")
+            name = client_name(headers.get("mastctl-client"))
+            return Caller(name, "admin", self.via, address_of(scope))
+        text, by_cookie = shown_token(scope, headers)
+        if text is None:
+            raise NotLetIn("no_token", "a token is expected: Authorization: Bearer TOKEN, or a cookie")
+        token = self.access.token_of(text)
+        if by_cookie and (changes(scope) or scope["type"] == "websocket") and "origin" not in headers:
+            raise NotAllowed("foreign_origin", "a request with the page's cookie carries its Origin")
+        return _named(token, scope, headers)
+
+    def stopper(self, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
+        """Return the caller of a stop or of a health check, which every client may request."""
+        if self.access is None:
+            return stranger(scope, headers) if forwarded(headers) else self.caller(scope, headers)
+        text, _ = shown_token(scope, headers)
+        token = None if text is None else self.access.known(text)
+        return stranger(scope, headers) if token is None else _named(token, scope, headers)
+
+
+def check_origin(headers: Mapping[str, str]) -> None:
+    """Pass a request that comes from no other site's page. Raises NotAllowed ``foreign_origin``."""
+    origin = headers.get("origin")
+    if origin is None:
+        return
+    parts, host = _url_parts(origin), headers.get("host", "").lower()
+    if not host or parts.netloc.lower() != host or parts.scheme not in SCHEMES:
+        raise NotAllowed("foreign_origin", f"Origin is '{_shown(origin)}', which is not this service")
+
+
+def check_site(headers: Mapping[str, str], *, page: bool = False) -> None:
+    """Pass a request that no browser marks as one of another site's page; to a ``page`` others may link.
+
+    Raises NotAllowed ``foreign_origin``.
+    """
+    site = headers.get("sec-fetch-site", "none").lower()
+    if site in ("same-origin", "none"):
+        return
+    if page and headers.get("sec-fetch-mode") == "navigate" and headers.get("sec-fetch-dest") == "document":
+        return
+    message = f"Sec-Fetch-Site is '{_shown(site)}': only the service's own page may request this"
+    raise NotAllowed("foreign_origin", message)
+
+
+def stranger(scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
+    """Return the caller of a request without a token, or of one that is refused before that is known."""
+    return Caller(client_name(headers.get("mastctl-client")), "view", NETWORK, address_of(scope))
+
+
+def shown_token(scope: Mapping[str, Any], headers: Mapping[str, str]) -> tuple[str | None, bool]:
+    """Return the token of a request, and whether it is the page's cookie; a header goes first."""
+    header = headers.get("authorization", "")
+    if header[: len(SCHEME)].lower() == SCHEME:
+        return header[len(SCHEME) :].strip(), False
+    name = cookie_name(scope)
+    parts = [part.strip().partition("=") for part in headers.get("cookie", "").split(";")]
+    tokens = [value for key, _, value in parts if key == name]
+    return (tokens[0], True) if tokens else (None, False)
+
+
+def cookie_name(scope: Mapping[str, Any]) -> str:
+    """Return the page's cookie: one for each port, as browsers share cookies between ports."""
+    server = scope.get("server")
+    port = server[1] if server else None
+    return f"mastctl-{port}" if port else "mastctl"
+
+
+def address_of(scope: Mapping[str, Any]) -> str:
+    """Return the address that a request came from; headers are not trusted for it."""
+    client = scope.get("client")
+    return str(client[0]) if client else "a socket of this machine"
+
+
+def from_this_machine(scope: Mapping[str, Any], headers: Mapping[str, str]) -> bool:
+    """Return whether a request came from this machine and by no proxy that states otherwise."""
+    client, server = scope.get("client"), scope.get("server")
+    if forwarded(headers):
+        return False
+    return not client or is_loopback(str(client[0])) or bool(server and client[0] == server[0])
+
+
+def forwarded(headers: Mapping[str, str]) -> str:
+    """Return the header by which a proxy states that a request came from elsewhere; empty without one.
+
+    Its value is not used: the client may have written it.
+    """
+    return next((name for name in headers if name in FORWARDED or name.startswith("x-forwarded-")), "")
+
+
+def changes(scope: Mapping[str, Any]) -> bool:
+    """Return whether a request may change something, by its method."""
+    return scope["type"] == "http" and scope["method"] not in ("GET", "HEAD", "OPTIONS")
+
+
+def _named(token: Token, scope: Mapping[str, Any], headers: Mapping[str, str]) -> Caller:
+    """The caller with a token: the token's name is proven, the one that the program gives itself is not."""
+    given = headers.get("mastctl-client")
+    name = f"{token.name}/{client_name(given)}" if given else token.name
+    return Caller(name, token.role, "token", address_of(scope), token.sha256)
+
+
+def _url_parts(text: str) -> Any:
+    try:
+        return urlsplit(text)
+    except ValueError:
+        return urlsplit("")
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
+
+
+def _shown(text: str) -> str:
+    return "".join(sign if sign.isprintable() else "?" for sign in text[:80])
+
+
 class Records(Protocol):
-    """What of `mastctl.control.entry.CommandEntry` keeps refusals."""
+    """The part of `mastctl.control.entry.CommandEntry` that keeps refusals."""
 
     def refused(self, caller: Caller, command: str, code: str, message: str) -> None: ...
-
-
-async def _at_once() -> None:
-    """Wait for nothing."""
 
 
 class Guard:
     """ASGI middleware around the API.
 
-    ``records`` gets what is refused before it is a command; ``turn`` is awaited before each request that is
-    no stop.
+    ``records`` gets the refusals of requests that are no commands yet; ``turn`` is awaited before each
+    request that is no stop.
     """
 
     def __init__(
-        self,
-        app: ASGIApp,
-        entrance: EntryRules | None = None,
-        records: Records | None = None,
-        turn: Callable[[], Awaitable[None]] = _at_once,
+        self, app: ASGIApp, entrance: EntryRules, turn: Callable[[], Awaitable[None]], records: Records | None
     ) -> None:
         self._app = app
-        self._entrance = entrance or EntryRules()
-        self._records = records
+        self._entrance = entrance
         self._turn = turn
+        self._records = records
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "http":
@@ -115,36 +273,35 @@ class Guard:
             await self._turn()
             headers = _headers(scope)
             self._let_in(scope, headers)
-            self._entrance.names.check_origin(headers)
-            by_cookie = self._entrance.access is not None and shown_token(scope, headers)[1]
-            if by_cookie and "origin" not in headers:
-                message = "a WebSocket with the page's cookie carries its Origin"
-                raise NotAllowed("foreign_origin", message)
+            check_origin(headers)
         except MastctlError as refused:
-            self._record(scope, bytes(refusal_response(refused).body))
-            await _refuse_websocket(refused, scope, receive, send)
+            answer = refusal_response(refused)
+            self._record(scope, bytes(answer.body))
+            if "websocket.http.response" in scope.get("extensions", {}):
+                await answer(scope, receive, send)
+            else:
+                await send({"type": "websocket.close", "code": 1008, "reason": ""})
             return
         await self._app(scope, receive, send)
 
     def _let_stop(self, scope: Scope, headers: Mapping[str, str]) -> None:
         """Pass a stop from anything but another site's page."""
-        entrance = self._entrance
         if "origin" in headers:
-            entrance.names.check_host(headers)
-            entrance.names.check_origin(headers)
+            self._entrance.check_host(headers)
+            check_origin(headers)
         check_site(headers)
-        _set_caller(scope, entrance.stopper(scope, headers))
+        _set_caller(scope, self._entrance.stopper(scope, headers))
 
     def _let_in(self, scope: Scope, headers: Mapping[str, str]) -> None:
         """Pass a request, or refuse it with the reason."""
         entrance, path = self._entrance, scope["path"]
-        entrance.names.check_host(headers)
+        entrance.check_host(headers)
         if changes(scope):
-            entrance.names.check_origin(headers)
+            check_origin(headers)
         check_site(headers, page=(path in PAGES or path.startswith(SITE)) and not changes(scope))
         _check_no_secret(scope)
         if path in PAGES or path.startswith(FILES):
-            _set_caller(scope, entrance.stranger(scope, headers))
+            _set_caller(scope, stranger(scope, headers))
         elif path in HEALTH and not changes(scope):
             _set_caller(scope, entrance.stopper(scope, headers))
         else:
@@ -164,7 +321,7 @@ class Guard:
             return
         if self._records is None or state.get("recorded") or not (changes(scope) or error["code"] in ATTACKS):
             return
-        caller = state.get("caller") or self._entrance.stranger(scope, _headers(scope))
+        caller = state.get("caller") or stranger(scope, _headers(scope))
         command = one_line(f"{scope.get('method', 'GET')} {scope['path']}", 100)
         self._records.refused(caller, command, error["code"], one_line(error["message"], 200))
 
@@ -191,36 +348,19 @@ def _check_no_secret(scope: Scope) -> None:
         raise BadHttp(400, "token_in_address", message)
 
 
-async def _refuse_websocket(refused: Exception, scope: Scope, receive: Receive, send: Send) -> None:
-    """Give the reason where the server can."""
-    if "websocket.http.response" not in scope.get("extensions", {}):
-        await send({"type": "websocket.close", "code": 1008, "reason": ""})
-        return
-    await refusal_response(refused)(scope, receive, send)
-
-
 async def whole_body(receive: Receive, headers: Mapping[str, str]) -> bytes:
     """Return the whole body, which may not be large. Raises BadHttp."""
     length = headers.get("content-length", "0")
-    if length.isdecimal() and int(length[:20]) > LARGEST_BODY_BYTES:
-        _too_large()
-    parts: list[bytes] = []
-    size = 0
-    while True:
+    size, body, more = int(length[:20]) if length.isdecimal() else 0, b"", True
+    while more and size <= LARGEST_BODY_BYTES:
         message = await receive()
         if message["type"] == "http.disconnect":
             raise BadHttp(400, "disconnected", "the client left before its request had come whole")
-        part = message.get("body", b"")
-        size += len(part)
-        if size > LARGEST_BODY_BYTES:
-            _too_large()
-        parts.append(part)
-        if not message.get("more_body", False):
-            return b"".join(parts)
-
-
-def _too_large() -> NoReturn:
-    raise BadHttp(413, "too_large", f"the body is larger than {LARGEST_BODY_BYTES} bytes")
+        body += message.get("body", b"")
+        size, more = len(body), message.get("more_body", False)
+    if size > LARGEST_BODY_BYTES:
+        raise BadHttp(413, "too_large", f"the body is larger than {LARGEST_BODY_BYTES} bytes")
+    return body
 
 
 def read_json(body: bytes, headers: Mapping[str, str]) -> Any:

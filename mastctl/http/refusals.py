@@ -195,6 +195,8 @@ def _methods_of(app: FastAPI, request: Request) -> list[str]:
 
 def _sentences(request: Request, errors: Sequence[Any]) -> list[str]:
     """What is wrong with the part of a request whose error comes first."""
+    if errors[0]["loc"] == ("body",) and errors[0].get("input") is None:
+        return ["the request has no body where a JSON object is expected"]
     part = errors[0]["loc"][0]
     inside = [{**one, "loc": one["loc"][1:]} for one in errors if one["loc"][0] == part]
     dependant = request.scope["route"].dependant

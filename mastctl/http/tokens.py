@@ -1,7 +1,7 @@
 """Tokens: 256 random bits each, with a name and a role; the list of them keeps digests only.
 
 The first run of a daemon that needs tokens makes one for each role, each in a file of its own beside the list
-(``admin.token``), for its user only. What ``mastctl rig token new`` makes is shown once and kept nowhere.
+(``admin.token``), for its user only. A token of ``mastctl rig token new`` is shown once and kept nowhere.
 """
 
 from __future__ import annotations
@@ -9,10 +9,12 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import hashlib
+import hmac
+import logging
 import os
 import secrets
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -24,8 +26,10 @@ from calib.files import remove, replace_bytes
 from calib.files.records import Record, read_value
 from mastctl.answers import Role
 from mastctl.control.lease import ROLES
-from mastctl.errors import MastctlError
+from mastctl.errors import MastctlError, NotLetIn
 from mastctl.safety.state_folder import StateFile
+
+log = logging.getLogger(__name__)
 
 TOKEN_BYTES = 32
 LIST_NAME = "tokens.json"
@@ -55,11 +59,6 @@ class Token(Record):
 _TOKENS = Annotated[list[Token], Field(max_length=MOST_TOKENS)]
 
 
-def digest_of(token: str) -> str:
-    """Return the digest by which a token is known."""
-    return hashlib.sha256(token.encode("utf-8", "surrogatepass")).hexdigest()
-
-
 class TokenList:
     """The tokens of one daemon, in its state folder. Each call reads the file anew."""
 
@@ -84,7 +83,7 @@ class TokenList:
             return None
         tokens = tuple(read_value(_TOKENS, document.get("tokens"), self.path, "tokens"))
         if len({one.name for one in tokens}) != len(tokens):
-            raise BadFile(self.path, "tokens", "a name is there twice")
+            raise BadFile(self.path, "tokens", "contains one name twice")
         return tokens
 
     def first_run(self) -> tuple[Token, ...]:
@@ -95,8 +94,12 @@ class TokenList:
                 return tokens
             made = []
             for role in ROLES:
-                text, token = new_token(role, role)
-                _save(self.file_of(role), f"{text}\n".encode())
+                text, token = _new_token(role, role)
+                path = self.file_of(role)
+                try:
+                    replace_bytes(path, f"{text}\n".encode(), 0o600)
+                except OSError as error:
+                    raise BadFile(path, "", f"cannot be saved: {error.strerror or error}") from None
                 made.append(token)
             self._write(made)
             return tuple(made)
@@ -107,12 +110,12 @@ class TokenList:
             expected = f"1 to {LONGEST_NAME} letters, digits, dots, dashes are expected"
             raise TokenRefused(f"'{name[:60]}' where {expected}")
         with self._locked():
-            tokens = list(self.read() or ())
+            tokens = self.read() or ()
             if any(one.name == name for one in tokens):
                 raise TokenRefused(f"there is a token '{name}' already; revoke it first")
             if len(tokens) >= MOST_TOKENS:
                 raise TokenRefused(f"there are {MOST_TOKENS} tokens; revoke one first")
-            text, token = new_token(name, role)
+            text, token = _new_token(name, role)
             self._write([*tokens, token])
             return text
 
@@ -146,15 +149,94 @@ class TokenList:
             os.close(lock)
 
 
-def new_token(name: str, role: Role) -> tuple[str, Token]:
-    """Return a new token's text, and the token as it is kept."""
+class Access:
+    """The tokens that a running daemon accepts, compared in constant time; safe to use from any thread.
+
+    They are made at the first run, and read again by `reread`. Raises BadFile.
+    """
+
+    def __init__(self, tokens: TokenList) -> None:
+        self._list = tokens
+        self._tokens = tokens.first_run()
+        self._temporary: tuple[Token, ...] = ()
+        self._seen = self._stamp()
+
+    @property
+    def folder(self) -> str:
+        """The folder of the tokens."""
+        return str(self._list.folder)
+
+    def token_of(self, text: str) -> Token:
+        """Return the token of a text. Raises NotLetIn ``wrong_token``."""
+        found = self.known(text)
+        if found is None:
+            raise NotLetIn("wrong_token", "the token is unknown; perhaps it was revoked")
+        return found
+
+    def known(self, text: str) -> Token | None:
+        """Return the token of a text, None for another text; takes the same time for both."""
+        digest, found = _digest_of(text), None
+        for token in (*self._tokens, *self._temporary):
+            if hmac.compare_digest(token.sha256, digest):
+                found = token
+        return found
+
+    def is_valid(self, digest: str) -> bool:
+        """Return whether the token of this digest is still valid."""
+        return any(one.sha256 == digest for one in (*self._tokens, *self._temporary))
+
+    def temporary(self, name: str) -> tuple[str, Callable[[], None]]:
+        """Return a token of the role operate for a program of this daemon's own, and its revocation.
+
+        It is in memory only. One call at a time.
+        """
+        text, token = _new_token(name, "operate")
+        self._temporary = (*self._temporary, token)
+
+        def revoke() -> None:
+            self._temporary = tuple(one for one in self._temporary if one is not token)
+
+        return text, revoke
+
+    def reread(self) -> None:
+        """Read the list again if it has changed; a damaged one changes nothing."""
+        stamp = self._stamp()
+        if stamp == self._seen:
+            return
+        self._seen = stamp
+        try:
+            tokens = self._list.read()
+        except BadFile as error:
+            log.error("the tokens stay as they were: %s", error)
+            return
+        if tokens is None:
+            log.error("the tokens stay as they were: %s is gone", self._list.path)
+            return
+        self._tokens = tokens
+        log.info("%d tokens: %s", len(tokens), ", ".join(one.name for one in tokens) or "none")
+
+    def _stamp(self) -> tuple[int, int, int] | None:
+        """A value that changes with the list."""
+        try:
+            found = self._list.path.stat()
+        except OSError:
+            return None
+        return found.st_mtime_ns, found.st_size, found.st_ino
+
+
+def _digest_of(token: str) -> str:
+    return hashlib.sha256(token.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def _new_token(name: str, role: Role) -> tuple[str, Token]:
+    """A new token's text, and the token as it is kept."""
     text = secrets.token_urlsafe(TOKEN_BYTES)
     made = datetime.now(UTC).isoformat(timespec="seconds")
-    return text, Token(name=name, role=role, sha256=digest_of(text), made=made)
+    return text, Token(name=name, role=role, sha256=_digest_of(text), made=made)
 
 
 def _check_private(path: Path) -> None:
-    """Pass a file that only its user may touch, or that is not there. Raises BadFile."""
+    """Pass a file that only its user may touch, or that does not exist. Raises BadFile."""
     try:
         mode = path.stat().st_mode
     except FileNotFoundError:
@@ -164,10 +246,3 @@ def _check_private(path: Path) -> None:
     if mode & _OTHERS_MAY:
         found = f"mode {stat.S_IMODE(mode):04o}"
         raise BadFile(path, "", f"other users of this machine may touch it ({found}); 'chmod 600' mends it")
-
-
-def _save(path: Path, data: bytes) -> None:
-    try:
-        replace_bytes(path, data, 0o600)
-    except OSError as error:
-        raise BadFile(path, "", f"cannot be saved: {error.strerror or error}") from None

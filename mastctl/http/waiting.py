@@ -1,23 +1,33 @@
-"""Requests that wait: for a thread, a device, an image, a change; and none for a daemon that ends.
+"""What waits: requests for a thread, a device or an image, streams for a change, connections for a request.
 
-The event loop itself never waits for a lock, a file or a device. Work that may wait runs here in worker
-threads; a request that waits when the daemon ends is refused at once, and its thread's result is dropped.
-Images have a limit of their own for each camera, so that a dead camera, however often it is requested, takes
-no thread from anything else. Long computations run in a few threads of the lowest priority.
+The event loop itself never waits for a lock, a file or a device. Work that may wait runs in worker threads; a
+request that waits when the daemon ends is refused at once, and its thread's result is dropped. Images have a
+limit of their own for each camera, so that a dead camera, however often it is requested, takes no thread from
+anything else. Long computations run in a few threads of the lowest priority.
+
+The web server bounds neither how long a client takes to send a request nor how many connections it opens. A
+hundred clients that send nothing, or headers without their body, could use up the descriptors of the process,
+and then a stop over HTTP would not arrive. So a connection that waits for its client's request is closed
+after a while, the oldest when they are many.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
+import resource
+import socket
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from anyio import CancelScope, CapacityLimiter, move_on_after
 from anyio.to_thread import run_sync
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from drivers.clock import Clock, SystemClock
 from mastctl.control.publisher import LoopSubscription, Publisher, Topic
@@ -63,7 +73,7 @@ class Waiting:
             await asyncio.sleep(0)
 
     def encode(self, function: Callable[[], T]) -> T:
-        """Return what ``function()`` returns, which computes for long: a few at a time, after all other work.
+        """Return the result of ``function()``, which computes for long: a few at once, after all other work.
 
         For a worker thread of `run` or `image`. Raises Unable ``closing``.
         """
@@ -77,12 +87,12 @@ class Waiting:
             raise _closing() from None
 
     async def run(self, function: Callable[[], T]) -> T:
-        """Return what ``function()`` returns, run in a worker thread. Raises Unable ``closing``."""
+        """Return the result of ``function()``, run in a worker thread. Raises Unable ``closing``."""
         return await self._unless_ending(function, self._workers)
 
     async def image(self, camera: str, function: Callable[[], T], kept: bool = False) -> T:
-        """Return what ``function()`` returns, which takes an image with a (known) camera, or encodes one that
-        is ``kept``: as many of these at once, and none of them waits for the camera.
+        """Return the result of ``function()``, which takes an image with a (known) camera, or encodes one
+        that is ``kept``: as many of these at once, and none of them waits for the camera.
 
         Raises Unable ``too_many`` if this one's turn does not come in 2 s, ``closing``.
         """
@@ -100,7 +110,9 @@ class Waiting:
                 with move_on_after(IMAGE_QUEUE_S if camera else None) as queue:
                     await limiter.acquire()
                 if queue.cancelled_caught:
-                    raise _too_many(camera)
+                    message = f"{IMAGES_AT_ONCE} images of {camera} are waited for, and none came in "
+                    message += f"{IMAGE_QUEUE_S:g} s; send the request again later"
+                    raise Unable("too_many", message, IMAGE_QUEUE_S)
                 try:
                     one = CapacityLimiter(1)  # the place is taken already
                     return await run_sync(self._at_work, function, abandon_on_cancel=True, limiter=one)
@@ -119,15 +131,6 @@ def _closing() -> Unable:
     return Unable("closing", "the daemon ends; the request will not be served")
 
 
-def _too_many(camera: str) -> Unable:
-    return Unable(
-        "too_many",
-        f"{IMAGES_AT_ONCE} images of {camera} are waited for, and none came in {IMAGE_QUEUE_S:g} s; "
-        "send the request again later",
-        IMAGE_QUEUE_S,
-    )
-
-
 def _lower_priority() -> None:
     """Let this thread come after all others; Linux counts niceness by thread."""
     os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), ENCODERS_NICE)
@@ -139,11 +142,10 @@ END_S = 1.5  # for the last events to be sent
 
 
 class Streams:
-    """The open event streams of one daemon, ``most`` at once; used on its event loop only."""
+    """The open event streams of one daemon; used on its event loop only."""
 
-    def __init__(self, publisher: Publisher, most: int = MOST_STREAMS) -> None:
+    def __init__(self, publisher: Publisher) -> None:
         self._publisher = publisher
-        self._most = most
         self._open: dict[LoopSubscription, str] = {}
         self._ended = False
 
@@ -158,8 +160,8 @@ class Streams:
         """
         if self._ended:
             raise Unable("closing", "the daemon ends; no more events follow")
-        if len(self._open) >= self._most:
-            raise Unable("too_many", f"{self._most} event streams are open, the most there may be", RETRY_S)
+        if len(self._open) >= MOST_STREAMS:
+            raise Unable("too_many", f"{MOST_STREAMS} event streams are open, the most there may be", RETRY_S)
         with self._publisher.subscribe_here(*topics, keys=keys) as news:
             self._open[news] = credential
             try:
@@ -186,3 +188,91 @@ class Streams:
         with move_on_after(END_S):
             while self._open:
                 await asyncio.sleep(0.005)
+
+
+SILENT_S = 20.0  # twice as long as the server keeps a connection for its next request
+SWEEP_S = 1.0
+
+
+class SilentConnections:
+    """The connections whose client has to send: no request has come, or no whole one.
+
+    There may be ``most``, by default a quarter of the process' descriptors. ``now_s`` is real time, since
+    clients do not live in simulated time.
+    """
+
+    def __init__(self, most: int | None = None, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._most = most
+        self._now_s = now_s
+        self._since: dict[tuple[Any, ...], tuple[socket.socket, float]] = {}  # by client, the oldest first
+
+    def add(self, connection: socket.socket, client: tuple[Any, ...]) -> None:
+        """Note a connection that waits for its client; the oldest is closed if these are too many.
+
+        ``client`` is the host and port of the client, as ASGI states them.
+        """
+        self._since[client] = (connection, self._now_s())
+        most = self._most or max(resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4, 1)
+        if len(self._since) > most:
+            self.close_old()
+        if len(self._since) > most:
+            self._close(next(iter(self._since)))
+
+    def close_old(self) -> None:
+        """Close connections on which nothing came for ``SILENT_S``; forget those that have ended."""
+        latest_s = self._now_s() - SILENT_S
+        for client, (connection, since_s) in list(self._since.items()):
+            if since_s <= latest_s or connection.fileno() < 0:
+                self._close(client)
+
+    async def watch(self) -> None:
+        """Close old connections until the task is cancelled."""
+        while True:
+            await asyncio.sleep(SWEEP_S)
+            self.close_old()
+
+    def around(self, app: ASGIApp) -> ASGIApp:
+        """Return an application that notes which connections have a whole request."""
+
+        async def noted(scope: Scope, receive: Receive, send: Send) -> None:
+            client = tuple(scope.get("client") or ())
+            connection, _ = self._since.pop(client, (None, 0.0))
+            whole = connection is None or scope["type"] != "http"
+
+            async def part() -> Message:
+                nonlocal whole
+                if whole or connection is None:
+                    return await receive()
+                self.add(connection, client)
+                try:
+                    message = await receive()
+                finally:
+                    self._since.pop(client, None)
+                whole = not message.get("more_body", False)
+                return message
+
+            try:
+                await app(scope, part, send)
+            finally:
+                if connection is not None and connection.fileno() >= 0:
+                    self.add(connection, client)
+
+        return noted
+
+    def _close(self, client: tuple[Any, ...]) -> None:
+        connection, _ = self._since.pop(client)
+        with contextlib.suppress(OSError):  # closed already
+            connection.shutdown(socket.SHUT_RDWR)
+
+
+class Listener(socket.socket):
+    """A listening TCP socket that notes each connection as silent."""
+
+    silent: SilentConnections | None = None
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """Accept a connection, as `socket.socket.accept`."""
+        connection, address = super().accept()
+        if self.silent is not None:
+            self.silent.add(connection, tuple(address[:2]))
+        return connection, address

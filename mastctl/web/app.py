@@ -40,7 +40,7 @@ def create_app(parts: Parts) -> ASGIApp:
         scope.setdefault("state", {})["parts"] = parts
         await routes(scope, receive, send)
 
-    return Guard(served, parts.entrance, parts.service.entry, parts.waiting.turn)
+    return Guard(served, parts.entrance, parts.waiting.turn, parts.service.entry)
 
 
 class _Read(Request):
@@ -85,6 +85,7 @@ def api() -> FastAPI:
         openapi_url=None,  # served by a route of our own, which does not make it on the event loop
         docs_url=None,
         redoc_url=None,
+        redirect_slashes=False,
     )
     app.router.route_class = _Route
     add_errors(app)

@@ -11,7 +11,7 @@ from typing import Annotated, cast
 from fastapi import Depends
 from fastapi.requests import HTTPConnection
 
-from mastctl.http.entrance import EntryRules
+from mastctl.http.guard import EntryRules
 from mastctl.http.waiting import Streams, Waiting
 from mastctl.service.service import Service
 from mastctl.web.pictures import CameraFeeds

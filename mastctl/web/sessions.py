@@ -7,7 +7,7 @@ from fastapi import FastAPI, Request, Response
 from mastctl.answers import ClientSession
 from mastctl.control.lease import Caller
 from mastctl.http import PREFIX
-from mastctl.http.entrance import cookie_name, shown_token
+from mastctl.http.guard import cookie_name, shown_token
 from mastctl.web.parts import Here
 
 COOKIE_S = 12 * 3600

@@ -8,7 +8,7 @@ from mastctl.answers import CalibrationReport, LiveTold, ReadyTold, SentinelTold
 from mastctl.answers.kinds import WELL
 from mastctl.errors import Unable
 from mastctl.http import PREFIX
-from mastctl.http.entrance import from_this_machine
+from mastctl.http.guard import from_this_machine
 from mastctl.watch.metrics import CONTENT_TYPE
 from mastctl.watch.sentinel import SENTINEL_FOLDER, findings
 from mastctl.web.commands import caller_of

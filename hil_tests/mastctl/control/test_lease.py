@@ -210,7 +210,7 @@ def test_a_lease_that_ends_with_a_stop_ends_with_nothing_else(world: World) -> N
 
 def test_a_lease_ends_with_the_token_that_it_was_granted_to(world: World) -> None:
     shown = {"of a token"}
-    world.leases.stands = shown.__contains__
+    world.leases.token_is_valid = shown.__contains__
     inside = world.leases.acquire(BENCH)
     assert world.leases.holds(inside.id), "who showed none keeps it"
     world.leases.release(inside.id)
@@ -243,7 +243,7 @@ def test_what_runs_is_stopped_when_its_lease_runs_out(world: World) -> None:
 def test_a_token_that_ends_stops_what_runs_under_its_lease(world: World) -> None:
     caller = Caller("rover", credential="of a token")
     world.steer(caller, world.leases.acquire(caller), starts=True)
-    world.leases.stands = lambda credential: False
+    world.leases.token_is_valid = lambda credential: False
     world.leases.stop_left_running()
     assert len(world.stops) == 1 and "token" in world.stops[0]
 

@@ -8,8 +8,7 @@ import pytest
 
 from mastctl.answers import Role
 from mastctl.errors import NotLetIn
-from mastctl.http.access import Access
-from mastctl.http.tokens import TokenList
+from mastctl.http.tokens import Access, TokenList
 
 
 @pytest.fixture
@@ -39,15 +38,15 @@ def test_new_lent_and_revoked_tokens_count_without_a_restart(access: Access, tok
     made = tokens.new("bench", "view")
     access.reread()
     digest = access.token_of(made).sha256
-    lent, take_back = access.lend("guide")
+    lent, take_back = access.temporary("guide")
     lent_digest = access.token_of(lent).sha256
     assert access.token_of(lent).role == "operate"
-    assert access.stands(digest) and access.stands(lent_digest) and not access.stands("")
+    assert access.is_valid(digest) and access.is_valid(lent_digest) and not access.is_valid("")
     tokens.revoke("bench")
     access.reread()
     take_back()
     assert access.known(made) is None and access.known(lent) is None
-    assert not access.stands(digest) and not access.stands(lent_digest)
+    assert not access.is_valid(digest) and not access.is_valid(lent_digest)
 
 
 def test_a_list_damaged_or_lost_meanwhile_changes_nothing(

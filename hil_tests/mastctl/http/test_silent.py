@@ -15,7 +15,7 @@ import pytest
 from hil_tests.mastctl.outside_daemon import daemon_process, line, write_config
 from hil_tests.waiting import NET_S
 from mastctl.client import Client
-from mastctl.http.silent import SILENT_S, SilentConnections
+from mastctl.http.waiting import SILENT_S, SilentConnections
 
 
 @pytest.fixture

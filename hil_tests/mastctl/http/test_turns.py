@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from mastctl.http.guard import Guard
+from mastctl.http.guard import EntryRules, Guard
 from mastctl.http.waiting import Waiting
 
 CROWD = 40
@@ -21,7 +21,7 @@ def test_a_stop_passes_what_came_before_it(stop: str) -> None:
         begun.append(scope["path"])
 
     async def crowd() -> None:
-        guard = Guard(inside, turn=Waiting().turn)
+        guard = Guard(inside, EntryRules(), Waiting().turn, None)
         requests = [("GET", "/api/v1/health/live")] * CROWD + [("POST", stop)]
         async with asyncio.TaskGroup() as group:
             for method, path in requests:

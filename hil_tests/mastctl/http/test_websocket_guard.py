@@ -8,10 +8,9 @@ from typing import Any
 
 import pytest
 
-from mastctl.http.access import Access
-from mastctl.http.entrance import EntryRules, HostNames
-from mastctl.http.guard import Guard
-from mastctl.http.tokens import TokenList
+from mastctl.http.guard import EntryRules, Guard
+from mastctl.http.tokens import Access, TokenList
+from mastctl.http.waiting import Waiting
 
 NAME = "rover.test"
 ORIGIN = {"origin": f"http://{NAME}"}
@@ -47,8 +46,8 @@ def asked(access: Access | None, headers: dict[str, str], query: bytes = b"", to
     async def send(message: Any) -> None:
         sent.append(message)
 
-    names = HostNames(frozenset({NAME}), any_address=True)
-    asyncio.run(Guard(inside, EntryRules(names, access))(scope, receive, send))
+    guard = Guard(inside, EntryRules(frozenset({NAME}), True, access), Waiting().turn, None)
+    asyncio.run(guard(scope, receive, send))
     if inside.came is not None:
         assert not sent
         return inside.came

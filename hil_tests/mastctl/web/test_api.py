@@ -131,6 +131,7 @@ BAD_POINTS: list[tuple[Any, str]] = [
     ({**ANGLES, "aim": {"camera": "navcam_left", "x_px": 1, "y_px": 1}}, "aim goes with pixel or position_m"),
     ({**ANGLES, "pointings": 2}, "pointings is 2, which goes with pixel only"),
     ([], "the body: a list of 0 where a mapping with deadline_s, "),
+    (None, "the request has no body where a JSON object is expected"),
 ]
 
 
@@ -176,6 +177,7 @@ def test_what_is_no_good_json_does_not_get_far(
     [
         ("GET", "/api/v1/nothing", 404, "not_found"),
         ("GET", "/api/v1/point", 405, "method_not_allowed"),
+        ("GET", "/api/v1/operations/", 404, "not_found"),
         ("GET", "/api/v1/operations/000001-ffff", 404, "operation_unknown"),
         ("GET", "/api/v1/snapshot/navcam_center", 404, "unknown_camera"),
         ("GET", "/api/v1/snapshot/navcam_left?format=gif", 422, "bad_request"),

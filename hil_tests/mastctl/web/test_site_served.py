@@ -12,8 +12,9 @@ import pytest
 from fastapi import FastAPI
 from starlette.testclient import TestClient
 
-from mastctl.http.guard import Guard
+from mastctl.http.guard import EntryRules, Guard
 from mastctl.http.refusals import add_errors
+from mastctl.http.waiting import Waiting
 from mastctl.web import page
 
 THEME = 'document.body.dataset.theme = "auto";'
@@ -27,7 +28,9 @@ def client(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[TestClie
     app = FastAPI(docs_url=None)
     add_errors(app)
     page.add_site(app)
-    with TestClient(Guard(app), base_url="http://127.0.0.1", follow_redirects=False) as made:
+    with TestClient(
+        Guard(app, EntryRules(), Waiting().turn, None), base_url="http://127.0.0.1", follow_redirects=False
+    ) as made:
         yield made
 
 
