@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import os
 from collections.abc import Iterator
 from itertools import chain
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
 from mastctl.cli.options import command, option
-from mastctl.cli.output import Answer, Shown, WrongUse, check_file, check_folder, unusable
+from mastctl.cli.output import Answer, Shown, WrongUse, check_file, check_folder, chosen, tables_of, unusable
 
 if TYPE_CHECKING:
     from calib.files.mast_file import StoredRig
@@ -21,6 +20,12 @@ if TYPE_CHECKING:
 
 OUTLIERS_SHOWN = 20
 TESTS_SHOWN = 4
+REFINED = (
+    "corrections.*.significant corrections.*.significance_sigmas corrections.*.shift_m "
+    "corrections.*.turn_rad corrections.*.handoffs corrections.*.rms_px corrections.*.unseen "
+    "corrections.*.outliers corrections.*.cameras_apart refusals.*.message other_mast"
+)
+"""What people see of a correction."""
 SURVEY_FILES = ("survey.yaml", "station.csv", "images.csv", "dots.csv", "clicks.csv")
 
 
@@ -81,13 +86,56 @@ MODELS = (
 def _calibrate(args: argparse.Namespace) -> Answer:
     """Read, check, find dots, fit, save, report; nothing is written before the fit is good."""
     if args.refine:
-        if args.model is not None:
-            raise WrongUse("--model is for a survey; a correction keeps the cameras' models")
-        from mastctl.cli import calibrate_refine
-
-        return calibrate_refine.refine(args)
+        return _refine(args)
     args.method, args.mast = args.method or "joint", args.mast or 6
     return _from_survey(args)
+
+
+def _refine(args: argparse.Namespace) -> Answer:
+    """Propose a correction by hand-offs as a new mast file; 1, and no file, if they show none."""
+    from calib.files.mast_file import load_rig
+    from mastctl.calibration.refined import pose_as_json, propose, save_refined
+    from mastctl.watch.handoffs import bias_record, read_log
+
+    for name in ("model", "report", "in_use", "method", "mast"):
+        if getattr(args, name) is not None:
+            option = f"--{name.replace('_', '-')}"
+            raise WrongUse(f"{option} belongs to a survey; --refine corrects by hand-offs alone")
+    if args.out.resolve() in {path.resolve() for path in (args.survey, *args.refine)}:
+        raise WrongUse(f"--out {args.out} is what is read; name another file, for the proposal")
+    check_file(args.out, "--out")
+    mast = load_rig(args.survey)
+    for note in mast.notes:
+        output.tell(note)
+    proposal = propose(mast, [read_log(path) for path in args.refine])
+    document: dict[str, Any] = {
+        "mast_file": None,
+        "former": {"path": str(proposal.mast.path), "digest": proposal.mast.digest},
+        "corrections": {
+            group: {**pose_as_json(pose), "significant": pose.significant}
+            for group, pose in proposal.poses.items()
+        },
+        "refusals": {
+            group: {"code": why.code, "message": str(why)} for group, why in proposal.refusals.items()
+        },
+        "bias": [bias_record(one) for one in proposal.bias],
+        "handoffs": len(proposal.handoffs),
+        "other_mast": proposal.other_mast,
+    }
+    shown: list[str | Shown] = [
+        *tables_of(chosen(document, REFINED)),
+        *(one.sentence for one in proposal.bias),
+        f"{proposal.mast.path} is as it was; a daemon uses the new one after 'mastctl rig mast use'",
+    ]
+    if not proposal.significant:
+        if not args.json:
+            output.show(args, Answer(document, shown[:-1]))
+        refusal = proposal.refusal()
+        raise output.CommandError(refusal.code, f"{refusal}; nothing was written", detail=document)
+    saved, previous = save_refined(proposal, args.out)
+    kept = None if previous is None else str(previous)
+    document["mast_file"] = {"path": str(saved.path), "digest": saved.digest, "previous": kept}
+    return Answer(document, [*tables_of(document["mast_file"], "proposed mast file"), *shown])
 
 
 def _from_survey(args: argparse.Namespace) -> Answer:
@@ -242,30 +290,22 @@ def _shown(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> Ite
         yield Shown("Wider models, the likeliest first", *wider)
     if (boards := finding_table("placement", fit.contradictions, TESTS_SHOWN)) is not None:
         yield Shown("Boards by the others, the least likely first", *boards)
-    if fit.outliers:
-        shown = [[outlier.name, _off(outlier)] for outlier in fit.outliers[:OUTLIERS_SHOWN]]
-        more = len(fit.outliers) - len(shown)
-        notes = [f"and {more} more, all in the mast file under fit.outliers"] if more > 0 else []
-        yield Shown(f"Left out ({len(fit.outliers)})", ["measurement", "off by"], shown, notes)
-    if fit.degenerate:
-        rows = [[", ".join(d.parameters[:4]), d.sentence] for d in fit.degenerate]
-        yield Shown("Left open by the survey", ["parameters", "why"], rows)
-    if in_use is not None and (changes := pointing_change(fit.rig, in_use.rig)):
-        rows = [[pair, *(f"{change[key]:.2f}" for key in change)] for pair, change in changes.items()]
-        yield Shown(
-            f"Pointing would change against {in_use.path.name}, px",
-            ["pair", "clicked, median", "most", "position, median", "most"],
-            rows,
-        )
+    tables: dict[str, list[dict[str, Any]]] = {
+        f"left out ({len(fit.outliers)})": [
+            {"measurement": one.name, "reason": one.sentence} for one in fit.outliers[:OUTLIERS_SHOWN]
+        ],
+        "left open by the survey": [
+            {"parameters": one.parameters[:4], "reason": one.sentence} for one in fit.degenerate
+        ],
+    }
+    if in_use is not None:
+        changes = pointing_change(fit.rig, in_use.rig)
+        tables[f"pointing against {in_use.path.name}"] = [
+            {"pair": name, **one} for name, one in changes.items()
+        ]
+    yield from tables_of({name: rows for name, rows in tables.items() if rows}, "more")
     reasons = [[reason.grade, reason.sentence] for reason in done.verdict.reasons]
     notes = [f"mast file: {done.saved.path} ({done.saved.digest[:12]})"]
     notes += [f"kept from before: {done.previous}"] if done.previous is not None else []
     notes += [f"report: {page}"] if page is not None else []
     yield Shown(f"Verdict: {done.verdict.words}", ["", "reason"], reasons, notes)
-
-
-def _off(outlier: Any) -> str:
-    if not math.isfinite(outlier.size):
-        return "out of view"
-    pixels = outlier.kind in ("dot", "image")
-    return f"{outlier.size:.2f} px" if pixels else f"{1000 * outlier.size:.1f} mm"

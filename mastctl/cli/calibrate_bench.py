@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from mastctl import signals
 from mastctl.cli import output
 from mastctl.cli.calibrate import MODELS, families_of
-from mastctl.cli.options import Group, at_least, command, one_of, option
+from mastctl.cli.options import Group, at_least, command, finite_number, one_of, option
 from mastctl.cli.output import Answer, CommandError, WrongUse, check_file, check_folder
 
 if TYPE_CHECKING:
@@ -34,14 +34,14 @@ FRAME = Group(
             option(
                 "--mast-at X Y Z RX RY RZ",
                 "the mast's place (metres, radians as in a mast file), as level and tape show it",
-                type=float,
+                type=finite_number,
             ),
             option("--mast-like MAST.yaml", "the mast's place as in this mast file"),
             option(
                 "--board-at X Y Z YAW PITCH ROLL",
                 "the first placement's board: its middle (metres), and its turn about the rover's "
                 "z, y, x (degrees; 0 0 0: upright, its face towards the rover)",
-                type=float,
+                type=finite_number,
             ),
             option("--body-stays", "body cameras stay where the former mast file has them"),
         ),
@@ -124,15 +124,9 @@ def _again(args: argparse.Namespace) -> Answer:
 
 def _frame(args: argparse.Namespace) -> RoverFrame:
     """What the rover frame hangs on, as far as it was stated."""
-    import math
-
     from calib.files.mast_file import load_rig
     from mastctl.bench.frame import RoverFrame
 
-    for name in ("mast_at", "board_at"):
-        numbers = getattr(args, name)
-        if numbers is not None and not all(math.isfinite(number) for number in numbers):
-            raise WrongUse(f"--{name.replace('_', '-')} has a number that is not finite")
     mast_at = args.mast_at
     if args.mast_like is not None:
         mast = load_rig(args.mast_like).rig.mast
@@ -153,42 +147,25 @@ def _drive(args: argparse.Namespace) -> Answer:
     board = load_board(args.board)
     folder = args.survey or survey_folder(args.out)
     kept = f"everything seen is kept in {folder}: the same command goes on"
-    while True:
-        try:
-            with _bench(args, board, folder) as (bench, reporter):
-                done = finish(bench, reporter, args.out, args.report)
-            break
-        except (BenchInterrupted, BoardNotFound, BoardLost, NoOperator) as reason:
-            if not _go_on(args, reason, folder):
-                raise CommandError(reason.code, f"{reason}; {kept}") from None
-        except (BenchNotFitted, NotWritten) as reason:
-            error = output.as_command_error(reason)
-            if isinstance(reason, BenchNotFitted):
-                kept += " with it, and --survey NEW begins anew"
-            raise CommandError(error.code, f"{reason}; {kept}", error.exit_code, error.detail) from None
-        except KeyboardInterrupt as interrupt:
-            number = getattr(interrupt, "number", signal.SIGINT)
-            sentence = f"interrupted; {kept}" if folder.exists() else "interrupted"
-            raise CommandError("interrupted", sentence, 128 + number) from None
+    try:
+        with _bench(args, board, folder) as (bench, reporter):
+            done = finish(bench, reporter, args.out, args.report)
+    except (BenchInterrupted, BoardNotFound, BoardLost, NoOperator) as reason:
+        raise CommandError(reason.code, f"{reason}; {kept}") from None
+    except (BenchNotFitted, NotWritten) as reason:
+        error = output.as_command_error(reason)
+        if isinstance(reason, BenchNotFitted):
+            kept += " with it, and --survey NEW begins anew"
+        raise CommandError(error.code, f"{reason}; {kept}", error.exit_code, error.detail) from None
+    except KeyboardInterrupt as interrupt:
+        number = getattr(interrupt, "number", signal.SIGINT)
+        sentence = f"interrupted; {kept}" if folder.exists() else "interrupted"
+        raise CommandError("interrupted", sentence, 128 + number) from None
     return _answer(done, {}, [])
 
 
 def _answer(done: BenchDone, models: dict[str, Any], lines: list[str]) -> Answer:
     return Answer(done.as_json() | models, [*done.lines(), *lines, done.verdict_line()])
-
-
-def _go_on(args: argparse.Namespace, reason: Exception, folder: Path) -> bool:
-    """Ask the person at the terminal, if there is one, whether to go on now."""
-    if args.json or not signals.can_ask():
-        return False
-    output.tell(f"{reason}. Everything seen is kept in {folder}")
-    sys.stderr.write("Enter to go on, Ctrl-C to leave it for later. ")
-    sys.stderr.flush()
-    try:
-        return bool(sys.stdin.readline())
-    except KeyboardInterrupt:
-        sys.stderr.write("\n")
-        return False
 
 
 class Terminal:
