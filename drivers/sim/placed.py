@@ -7,18 +7,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
+from calib.errors import BadFile
 from calib.files.records import ABSENT, problem
 from calib.geometry.rig import Rig
-from calib.targets.boards import Charuco, DotBoard
+from calib.targets.board_file import board_of
+from calib.targets.boards import AnyBoard, DotBoard
 from drivers.errors import BadOptions
-from drivers.options import DriverOptions, ReadBy, is_whole, one_of, read_options
+from drivers.options import DriverOptions, ReadBy, is_whole, read_options
 
 Float64 = NDArray[np.float64]
 
@@ -29,7 +31,6 @@ MOST = {"rocks": 500, "bricks": 100, "boards": 24}
 BOARD_M = 0.02  # thick
 ROVER_M = 0.5  # from its origin nothing is placed nearer than this, or than its cameras reach
 CLEAR_M = 0.05  # beyond the cameras' reach
-DICTIONARIES = {name: getattr(cv2.aruco, name) for name in dir(cv2.aruco) if name.startswith("DICT_")}
 
 
 class _Placed(DriverOptions):
@@ -43,10 +44,6 @@ class _Placed(DriverOptions):
 
 _Heading = Annotated[float, Field(ge=-2 * math.pi, le=2 * math.pi)]
 _Side = Annotated[float, Field(ge=0.02, le=3.0)]
-_Count = Annotated[int, Field(ge=2, le=50)]
-_Spacing = Annotated[float, Field(ge=0.005, le=1.0)]
-_Mark = Annotated[float, Field(ge=0.002, le=1.0)]
-_Margin = Annotated[float, Field(ge=0.0, le=1.0)]
 
 
 class PlacedRock(_Placed):
@@ -68,109 +65,50 @@ class PlacedBrick(_Placed):
 class PlacedBoard(_Placed):
     """A board: the middle of its lower edge over (x, y), ``raised_m`` over the ground.
 
-    Its face looks along the heading (by default towards the site's origin), ``lean_rad`` upwards.
+    Its face looks along the heading (by default towards the site's origin), ``lean_rad`` upwards. The print's
+    own keys stand beside these in a configuration, as in a BOARD.yaml.
     """
+
+    model_config = ConfigDict(arbitrary_types_allowed=True)
 
     heading_rad: _Heading = ABSENT
     lean_rad: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
     raised_m: Annotated[float, Field(ge=0.0, le=3.0)] = 0.0
-    rows: _Count = 10
-    columns: _Count = 10
-
-    @property
-    def board(self) -> DotBoard | Charuco:
-        """What is printed."""
-        raise NotImplementedError
+    margin_m: Annotated[float, Field(ge=0.0, le=1.0)] = 0.02
+    """White paper around the print; around dots from the outer ones' middles."""
+    board: AnyBoard
 
     @property
     def paper_m(self) -> float:
         """White paper around the print."""
-        raise NotImplementedError
+        dot_m = self.board.dot_diameter_m if isinstance(self.board, DotBoard) else 0.0
+        return self.margin_m - dot_m / 2
 
     @property
     def size_m(self) -> Float64:
         """Width and height with the white paper, (2,)."""
         return np.array(self.board.size_m) + 2 * self.paper_m
 
-    def _check(self) -> None:
-        """Set the usual heading, and refuse a board of no usual size."""
+    @model_validator(mode="after")
+    def _check(self) -> Self:
         if self.heading_rad is None:
             object.__setattr__(self, "heading_rad", math.atan2(-self.y_m, -self.x_m))
+        if self.paper_m < 0:
+            raise problem("margin_m", f"{self.margin_m:g} where half a dot at least is expected")
         width, height = self.size_m
         if not 0.05 <= max(width, height) <= 4.0:
             raise problem("", f"{width:g} x {height:g} m where 0.05 to 4 m is expected")
-
-
-class PlacedDots(PlacedBoard):
-    """Round dots in rows and columns, as of a survey's board; the margin is from the outer dots' centres."""
-
-    kind: Literal["dots"] = "dots"
-    spacing_m: _Spacing = 0.08
-    dot_diameter_m: _Mark = 0.04
-    margin_m: _Margin = 0.08
-
-    @property
-    def board(self) -> DotBoard:
-        """What is printed."""
-        return DotBoard(self.columns, self.rows, self.spacing_m, self.dot_diameter_m)
-
-    @property
-    def paper_m(self) -> float:
-        """White paper around the print."""
-        return self.margin_m - self.dot_diameter_m / 2
-
-    @model_validator(mode="after")
-    def _check_face(self) -> Self:
-        diameter_m = self.dot_diameter_m
-        if not diameter_m < self.spacing_m:
-            less = f"less than spacing_m, {self.spacing_m!r}"
-            raise problem("dot_diameter_m", f"{diameter_m!r} where {less}, is expected")
-        if not self.margin_m >= diameter_m / 2:
-            least = f"half a dot at least, {diameter_m / 2:g}"
-            raise problem("margin_m", f"{self.margin_m!r} where {least}, is expected")
-        self._check()
-        return self
-
-
-class PlacedCharuco(PlacedBoard):
-    """A ChArUco board of OpenCV: squares in rows and columns, markers of a dictionary in the white ones."""
-
-    kind: Literal["charuco"] = "charuco"
-    rows: _Count = 7
-    columns: _Count = 10
-    square_m: _Spacing = 0.08
-    marker_m: _Mark = 0.06
-    dictionary: Annotated[str, one_of(DICTIONARIES)] = "DICT_5X5_100"
-    margin_m: _Margin = 0.02
-
-    @property
-    def board(self) -> Charuco:
-        """What is printed."""
-        return Charuco(self.columns, self.rows, self.square_m, self.marker_m, self.dictionary)
-
-    @property
-    def paper_m(self) -> float:
-        """White paper around the print."""
-        return self.margin_m
-
-    @model_validator(mode="after")
-    def _check_face(self) -> Self:
-        if not self.marker_m < self.square_m:
-            less = f"less than square_m, {self.square_m!r}"
-            raise problem("marker_m", f"{self.marker_m!r} where {less}, is expected")
-        markers = self.rows * self.columns // 2
-        holds = len(cv2.aruco.getPredefinedDictionary(DICTIONARIES[self.dictionary]).bytesList)
-        if markers > holds:
-            squares = f"{self.rows} x {self.columns} squares need {markers} markers"
-            raise problem("", f"{squares}, {self.dictionary} has {holds}")
-        self._check()
         return self
 
 
 Placed = PlacedRock | PlacedBrick | PlacedBoard
-KINDS: Mapping[str, type[Placed]] = {
-    "rocks": PlacedRock, "bricks": PlacedBrick, "dots": PlacedDots, "charuco": PlacedCharuco
+PRINTS: Mapping[str, Mapping[str, Any]] = {
+    "dots": {"rows": 10, "columns": 10, "spacing_m": 0.08, "dot_diameter_m": 0.04},
+    "charuco": {
+        "rows": 7, "columns": 10, "square_m": 0.08, "marker_m": 0.06, "dictionary": "DICT_5X5_100"
+    },
 }  # fmt: skip
+"""What a board has where a configuration leaves it out, by its kind."""
 
 
 def placed_or(kind: str, most: int = 0) -> ReadBy:
@@ -195,9 +133,19 @@ def _one(kind: str, value: Any, key: str) -> Placed:
         return value
     if not isinstance(value, Mapping):
         raise BadOptions(f"{key} is {value!r}, expected keys and values, as {{x_m: 5, y_m: 0}}")
-    if kind == "boards" and (kind := value.get("kind", "dots")) not in ("dots", "charuco"):
-        raise BadOptions(f"{key}.kind: {kind!r} where one of dots, charuco is expected")
-    return read_options(KINDS[kind], value, place=key)
+    if kind == "rocks":
+        return read_options(PlacedRock, value, place=key)
+    if kind == "bricks":
+        return read_options(PlacedBrick, value, place=key)
+    own = {name: value[name] for name in PlacedBoard.model_fields if name in value and name != "board"}
+    printed = {name: one for name, one in value.items() if name not in own}
+    printed = {"kind": "dots", **PRINTS.get(str(printed.get("kind", "dots")), {}), **printed}
+    if printed["kind"] == "dots":
+        own.setdefault("margin_m", 0.08)
+    try:
+        return read_options(PlacedBoard, {**own, "board": board_of("", key, printed)}, place=key)
+    except BadFile as error:
+        raise BadOptions(f"{error.place}: {error.reason}") from None
 
 
 def footprint_m(thing: Placed) -> Float64:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 from unittest.mock import patch
@@ -251,7 +251,7 @@ def _ptu_rig(
     step_rad = D48E_STEP_RAD if name == "PTU, TCP" else D46_STEP_RAD
     acceleration = round(ACCELERATION_RAD_PER_S2 / step_rad)
     for axis in (unit.pan, unit.tilt):  # as somebody left it; setting it by PA would take the unit seconds
-        axis.now = replace(axis.now, acceleration=acceleration)
+        axis.acceleration = acceleration
     options = {
         "port": port,
         "pan": {"limits_rad": list(LIMITS_RAD[0]), "sign": -1},
@@ -262,7 +262,7 @@ def _ptu_rig(
         stack.enter_context(patch.object(conversation, "REPLY_S", PATIENT_S))
     head = open_flir_ptu(options, clock, opens)
     stack.callback(head.close)
-    fastest = unit.pan.now.fastest * step_rad  # its own; the options' speed is for moves that name none
+    fastest = unit.pan.fastest * step_rad  # its own; the options' speed is for moves that name none
     return HeadRig(name, head, clock, panel, _truth(axes), step_rad, line, sent, fastest_rad_per_s=fastest)
 
 

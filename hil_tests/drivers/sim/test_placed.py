@@ -131,11 +131,11 @@ def test_a_brick_is_met_where_its_numbers_put_it(placed: Scene) -> None:
         ({"rocks": [{"x_m": 30, "y_m": 0}]}, r"rocks\[0\].x_m: 30 where a number from -28 to 28 is"),
         (
             {"boards": [{"x_m": 3, "y_m": 0, "kind": "checker"}]},
-            "kind: 'checker' where",
+            r"boards\[0\].kind: the text 'checker' where",
         ),
         (
             {"boards": [{"x_m": 3, "y_m": 0, "kind": "charuco", "dictionary": "DICT_4X4_50", "rows": 20}]},
-            "need 100 markers, DICT_4X4_50 has 50",
+            "needs 100 markers, and DICT_4X4_50 has 50",
         ),
         (
             {"boards": [{"x_m": 3, "y_m": 0}], "bricks": [{"x_m": 3, "y_m": 0.2}]},
