@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import cv2
@@ -22,14 +22,14 @@ from drivers.clock import Clock
 from drivers.errors import BadSetting, NoFreshFrame, NoReply
 from drivers.faults import Fault, FaultPanel
 from drivers.interfaces import Camera, CameraInfo, CameraSetting, Frame, FrameTime, Image
-from drivers.sim.sensor import AutoExposure, FixedExposure, FrameExposure, Noise, Readout
+from drivers.sim.sensor import AutoExposure, FixedExposure, FrameExposure, Readout
 from drivers.sim.settings import CameraSettings, ClockSettings
 
 RING_FRAMES = 4
 """Finished frames that can still be fetched, as in a capture ring of four buffers."""
 
 ANY, NEXT_FRAME, CLOSE, RECENT_TIMES, INFO, EXPOSURE_HELD, SETTINGS = range(7)
-"""What the parameter ``call`` names."""
+"""What the parameter ``call`` of the fault ``hang`` names."""
 
 SHORTEST_S, LONGEST_SHARE = 1e-5, 0.99
 """Bounds of an exposure set at run time: the longest is a share of what a frame has room for."""
@@ -129,8 +129,8 @@ class SimulatedCamera(Camera):
         self._epochs = [_Epoch(self._own.first_s, 0, self._own.true_period_s(1 / settings.rate_hz))]
         self._last: Frame | None = None
         self._frozen: tuple[Fault, Image] | None = None
-        noise = Noise(settings.read_noise_dn, settings.shot_noise_dn, settings.seed, name)
-        self._readout = Readout(noise, settings.colour, settings.jpeg_quality)
+        noise = settings.read_noise_dn, settings.shot_noise_dn, settings.seed
+        self._readout = Readout(*noise, name, settings.colour, settings.jpeg_quality)
         self._rolling_s = (size_px[1] - 1) * settings.row_time_s
         # the begin of an exposure, stated by its middle and length, comes back with another last bit
         self._rounding_s = 1e-9 if settings.row_time_s or settings.exposure.auto else 0.0
@@ -177,8 +177,8 @@ class SimulatedCamera(Camera):
     def settings(self) -> list[CameraSetting]:
         """Return exposure and gain; its focus stands fixed."""
         self._hang(SETTINGS)
-        fixed = isinstance(self._exposure, FixedExposure)
-        exposure_s, gain = self._exposure.now if isinstance(self._exposure, FixedExposure) else (None, None)
+        fixed = self._exposure.now is not None
+        exposure_s, gain = self._exposure.now or (None, None)
         refusal = "" if fixed else "is set by simulation.cameras.exposure.auto"
         longest_s = LONGEST_SHARE * (1 / self._settings.rate_hz - self._rolling_s)
         return [
@@ -219,7 +219,7 @@ class SimulatedCamera(Camera):
     def exposure_held(self) -> Iterator[None]:
         """Return a context in which the exposure does not change."""
         self._hang(EXPOSURE_HELD)
-        with self._exposure.held() if isinstance(self._exposure, AutoExposure) else nullcontext():
+        with self._exposure.held():
             yield
 
     def close(self) -> None:
@@ -312,7 +312,9 @@ class SimulatedCamera(Camera):
         if fault := self._faults.find(self.name, "frozen", begin_s):
             if self._frozen is None or self._frozen[0] is not fault:
                 before = epoch.after(fault.begin_s) - 1
-                self._frozen = (fault, self._healthy(before, epoch, self._shot(before, epoch)))
+                shot = self._shot(before, epoch)
+                light = self._expose(epoch.begin_s(before), shot.exposure_s)
+                self._frozen = (fault, self._readout.picture(light, before, shot))
             return self._frozen[1].copy()
         if fault := self._faults.find(self.name, "garbage", begin_s):
             generator = np.random.default_rng([int(fault.number("seed")), sequence])
@@ -320,17 +322,12 @@ class SimulatedCamera(Camera):
             return generator.integers(0, 256, shape, dtype=np.uint8)
         if self._faults.find(self.name, "dark", begin_s):
             return self._readout.picture(np.zeros(self._size_px[::-1], np.float32), sequence, shot)
-        image = self._healthy(sequence, epoch, shot)
+        image = self._readout.picture(self._expose(begin_s, shot.exposure_s), sequence, shot)
         if fault := self._faults.find(self.name, "wrong", begin_s):
             shift = np.array([[1, 0, fault.number("dx_px")], [0, 1, fault.number("dy_px")]])
             shifted = cv2.warpAffine(image, shift, self._size_px, borderMode=cv2.BORDER_REPLICATE)
             return np.asarray(shifted, dtype=np.uint8)
         return image
-
-    def _healthy(self, sequence: int, epoch: _Epoch, shot: FrameExposure) -> Image:
-        """The picture without faults."""
-        light = self._expose(epoch.begin_s(sequence), shot.exposure_s)
-        return self._readout.picture(light, sequence, shot)
 
     def _instead(self, exposed_after_s: float, timeout_s: float) -> str:
         """What to say when no fresh frame came."""

@@ -19,13 +19,11 @@ HISTORY_S = 60.0
 
 @dataclass(frozen=True)
 class Leg:
-    """A move to rest at ``goal_rad``, continuous in position and velocity from its start.
+    """A move to rest at ``goal_rad``, continuous in position and signed speed from its start.
 
     The time-optimal trapezoid: accelerate (or brake, or turn round) to the cruise speed, cruise, brake.
     A start faster than ``speed_rad_per_s`` brakes to it first; a goal nearer than the stopping distance
     is overshot and come back to.
-
-    It begins at ``start_s``, at ``start_rad``, with the signed speed ``start_rad_per_s``.
     """
 
     start_s: float
@@ -108,11 +106,6 @@ class Leg:
         return self.goal_rad - direction * to_go, direction * cruise
 
 
-def rest(time_s: float, position_rad: float) -> Leg:
-    """Return a leg that stands still from ``time_s`` on."""
-    return Leg(time_s, position_rad, 0.0, position_rad, 1.0, 1.0)
-
-
 @dataclass(frozen=True)
 class Motion:
     """The legs of an axis, oldest first; a leg holds until the next one starts.
@@ -124,8 +117,8 @@ class Motion:
 
     @staticmethod
     def at_rest(time_s: float, position_rad: float) -> Motion:
-        """Return an axis that stands still."""
-        return Motion((rest(time_s, position_rad),))
+        """Return the motion of an axis that stands still."""
+        return Motion((Leg(time_s, position_rad, 0.0, position_rad, 1.0, 1.0),))
 
     def leg_index(self, time_s: float) -> int:
         """Return which leg holds at a moment; the oldest for one before the history."""
@@ -205,4 +198,4 @@ class Motion:
 
     def jammed(self, time_s: float) -> Motion:
         """Return the motion seized at ``time_s``: at rest at once (the one jump in velocity; a fault)."""
-        return self._then(time_s, [rest(time_s, self.at(time_s)[0])])
+        return self._then(time_s, Motion.at_rest(time_s, self.at(time_s)[0]).legs)

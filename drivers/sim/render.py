@@ -26,7 +26,7 @@ from calib.geometry.rigid import Rigid
 from drivers.errors import BadOptions
 from drivers.sim import kernels
 from drivers.sim.scene import Scene, tiny_scene
-from drivers.sim.sensor import Noise
+from drivers.sim.sensor import FrameExposure, Readout
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -64,17 +64,13 @@ class RayTable(NamedTuple):
 def ray_table(camera: CameraModel, samples: int) -> RayTable:
     """Return the rays through every sample of every pixel of ``camera``, as the model gives them."""
     width, height = camera.size_px
-    x_px, y_px = (sample_places(count, samples) for count in (width, height))
-    found = interpolated(camera, x_px, y_px)
-    if found is None:
-        found = exact(camera, x_px, y_px)
+    x_px, y_px = ((np.arange(count * samples) + 0.5) / samples - 0.5 for count in (width, height))
+    found = interpolated(camera, x_px, y_px) or exact(camera, x_px, y_px)
     rays, starts = (in_pixels(part, samples) for part in found)
-    return RayTable(rays, starts, *(beams(rays, starts, samples, size) for size in (TILE_PX, BLOCK_PX)))
-
-
-def sample_places(count: int, samples: int) -> Float64:
-    """Return (count * samples,) the places of samples along a side of ``count`` pixels."""
-    return (np.arange(count * samples) + 0.5) / samples - 0.5
+    beams = [np.empty((-(-height // size), -(-width // size), 6)) for size in (TILE_PX, BLOCK_PX)]
+    for table, size in zip(beams, (TILE_PX, BLOCK_PX), strict=True):
+        kernels.hold_rays(rays, starts, samples, size, table)
+    return RayTable(rays, starts, *beams)
 
 
 def exact(camera: CameraModel, x_px: Float64, y_px: Float64) -> tuple[Float32, Float32]:
@@ -135,18 +131,8 @@ def in_pixels(values: Float32, samples: int) -> Float32:
     return np.ascontiguousarray(cut).reshape(rows // samples, columns // samples, samples**2, 3)
 
 
-def beams(rays: Float32, starts: Float32, samples: int, size_px: int) -> Float64:
-    """Return (rows, columns, 6): the mean direction of each square of pixels, and how far its rays spread."""
-    table = np.empty((-(-rays.shape[0] // size_px), -(-rays.shape[1] // size_px), 6))
-    kernels.hold_rays(rays, starts, samples, size_px, table)
-    return table
-
-
 class Renderer:
-    """Draws one scene; may be called from several threads.
-
-    So many ``workers`` share the work of a picture; the machine's processors by default.
-    """
+    """Draws one scene, by so many ``workers``: the machine's processors by default. Safe from any thread."""
 
     def __init__(self, scene: Scene, workers: int | None = None) -> None:
         self.scene = scene
@@ -165,13 +151,12 @@ class Renderer:
         """Return the picture (h, w) that ``camera`` takes of the scene: brightness 0 to 255, noise-free.
 
         The model is in the frame it is mounted in (head or rover). Its rays are computed once and kept, so
-        give the same model with another transform for another pose, not a moved model. C must be above the
-        ground, and within 32 m of the site's origin in x and y. Each pixel is the mean of samples x samples
-        rays, 1 to 8 across. Of rows outside [first, last) some are 0. Pixels for which the model has no ray
-        are 0, and so are those whose ray starts under the ground (in CAHVORE rays start the farther from C
-        the more they bend).
+        give the same model with another transform for another pose, not a moved model. Of rows outside
+        [first, last) some are 0. So are pixels for which the model has no ray, or whose ray starts under the
+        ground (in CAHVORE rays start the farther from C the more they bend).
 
-        Raises BadOptions if ``samples`` is out of bounds, or the camera stands where it sees nothing.
+        Raises BadOptions for other than 1 to 8 ``samples``, or if C is not above the ground and within 32 m
+        of the site's origin in x and y.
         """
         if not 1 <= samples <= MAX_SAMPLES:
             raise BadOptions(f"{samples} samples across a pixel where 1 to {MAX_SAMPLES} are possible")
@@ -228,9 +213,8 @@ class Renderer:
 class Stills:
     """Pictures of poses seen lately, so that a camera at rest before a scene that stands is drawn once.
 
-    A picture without noise is a function of scene, camera, pose and samples alone. The scene never changes
-    and the key holds every bit of the others, so nothing can be stale. Whatever else is to change what a
-    camera sees (light, dust, exposure, temperature) comes after this, or joins the key. Safe from any thread.
+    A picture without noise is a function of scene, camera, pose and samples alone; the key has every bit of
+    these. What else changes a picture (light, dust, exposure) comes after this. Safe from any thread.
     """
 
     def __init__(self, draw: Draw) -> None:
@@ -286,5 +270,5 @@ def compile_renderer() -> None:
     renderer = Renderer(scene, workers=1)
     image = renderer.image(camera, Rigid.identity(), samples=1)
     renderer.close()
-    Noise(1.0, 1.0, 0, "").levels(image, image, 0)
+    Readout(1.0, 1.0, 0, "").picture(image, 0, FrameExposure(1.0))
     scene.cast([0.0, 0.0, -1.5], [1.0, 0.0, 1.0])

@@ -134,7 +134,22 @@ class RoverModel:
         self._through_lens: dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
         self._metered_at: dict[str, tuple[Rigid, NDArray[np.float32]]] = {}
         self.cameras: Mapping[str, SimulatedCamera] = MappingProxyType(
-            {name: self._camera(name, clock, start_s) for name in self.rig.cameras}
+            {
+                name: SimulatedCamera(
+                    name,
+                    settings.camera,
+                    camera.model.size_px,
+                    partial(self._exposed, name),
+                    partial(self._remember, name),
+                    clock,
+                    self.faults,
+                    start_s,
+                    settings.clocks.get(name, ClockSettings()),
+                    self.sensor_modes[name],
+                    partial(self._metered, name),
+                )
+                for name, camera in self.rig.cameras.items()
+            }
         )
 
     def _set_mode(self, name: str, mode: Mode) -> None:
@@ -293,14 +308,6 @@ class RoverModel:
             self._closed = True
             self._renderer.close()
 
-    def _camera(self, name: str, clock: Clock, start_s: float) -> SimulatedCamera:
-        """One camera of the true rig."""
-        settings, size_px = self.settings.camera, self.rig.cameras[name].model.size_px
-        own = self.settings.clocks.get(name, ClockSettings())
-        expose, taken = partial(self._exposed, name), partial(self._remember, name)
-        usual = (name, settings, size_px, expose, taken, clock, self.faults, start_s, own)
-        return SimulatedCamera(*usual, self.sensor_modes[name], partial(self._metered, name))
-
     def _exposed(self, name: str, begin_s: float, exposure_s: float) -> NDArray[np.float32]:
         """The light of one exposure on the sensor.
 
@@ -313,7 +320,9 @@ class RoverModel:
         if way_rad <= RESTS_RAD:
             return self._at_rest(name, mid_s)
         if settings.smear or settings.row_time_s:
-            light = self._shutter(name, mid_s).light(begin_s, exposure_s, self.settings.samples)
+            pose, draw = partial(self._pose, name), partial(self._draw, name)
+            shutter = Shutter(self._model(name, mid_s), settings.row_time_s, pose, draw, self._cast)
+            light = shutter.light(begin_s, exposure_s, self.settings.samples)
         else:
             light = self._copies(name, begin_s, exposure_s, way_rad)
         if light is None:
@@ -332,20 +341,9 @@ class RoverModel:
         views = []
         for step in range(count):
             pose = self._pose(name, begin_s + (step + 0.5) / count * exposure_s)
-            with self._drawing(name):
-                views.append(self._boards.image(few, pose, 1))
+            views.append(self._draw(name, few, pose, 1))
         light = np.asarray(np.mean(views, axis=0), dtype=np.float32)
         return np.asarray(cv2.resize(light, model.size_px, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
-
-    def _shutter(self, name: str, time_s: float) -> Shutter:
-        """The shutter of a camera as it is at a moment."""
-
-        def draw(model: CameraModel, pose: Rigid, samples: int, rows: tuple[int, int]) -> NDArray[np.float32]:
-            with self._drawing(name):
-                return self._boards.image(model, pose, samples, rows)
-
-        model, row_time_s = self._model(name, time_s), self.settings.camera.row_time_s
-        return Shutter(model, row_time_s, partial(self._pose, name), draw, self._cast)
 
     def _at_rest(self, name: str, time_s: float) -> NDArray[np.float32]:
         """The picture of a moment through the lens, read-only; kept while nothing moves."""
@@ -364,9 +362,7 @@ class RoverModel:
         """A coarse picture of a moment, as an automatic exposure sees it; kept while nothing moves."""
         pose, kept = self._pose(name, time_s), self._metered_at.get(name)
         if kept is None or kept[0] != pose:
-            camera = coarse(self.rig.cameras[name].model, METER_PX)
-            with self._drawing(name):
-                light = self._boards.image(camera, pose, 1)
+            light = self._draw(name, coarse(self.rig.cameras[name].model, METER_PX), pose, 1)
             if not self._lenses[name].changes_nothing:
                 light *= self._lenses[name].transmission.mean()
             self._metered_at[name] = kept = (pose, light)
@@ -402,6 +398,13 @@ class RoverModel:
         if self.rig.cameras[name].on != "head":
             return self.site_from_rover
         return self.site_from_rover @ self._rover_from_frame(name, time_s)
+
+    def _draw(
+        self, name: str, camera: CameraModel, pose: Rigid, samples: int, rows: tuple[int, int] | None = None
+    ) -> NDArray[np.float32]:
+        """A picture of the scene with its boards."""
+        with self._drawing(name):
+            return self._boards.image(camera, pose, samples, rows)
 
     @contextmanager
     def _drawing(self, name: str) -> Iterator[None]:

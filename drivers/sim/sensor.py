@@ -11,8 +11,8 @@ import math
 import threading
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -67,6 +67,10 @@ class FixedExposure:
         """The newest exposure time and gain."""
         return self._set[-1][1:]
 
+    def held(self) -> AbstractContextManager[None]:
+        """Return a context in which nothing changes: nothing does so by itself."""
+        return nullcontext()
+
     def longest_s(self, now_s: float) -> float:
         """Return the longest exposure time of frames that are requested at a moment."""
         return max(exposure_s for _, exposure_s, _ in self._recent(now_s))
@@ -107,25 +111,24 @@ class AutoExposure:
         self._now_s = now_s
         self._amounts_s: dict[int, float] = {}  # time times gain, by frame
         self._next_frame = 0
-        self._holds: list[tuple[float, float]] = []
-        self._held = 0
-        self._held_since_s = 0.0
+        self._holds: list[list[float]] = []  # from when until when the exposure stays as it is
         self._lock = threading.Lock()
+
+    @property
+    def now(self) -> None:
+        """No time and gain: they follow the pictures."""
+        return None
 
     @contextmanager
     def held(self) -> Iterator[None]:
         """Keep the exposure of all frames that begin inside the block as it is."""
+        hold = [self._now_s(), math.inf]
         with self._lock:
-            self._held += 1
-            if self._held == 1:
-                self._held_since_s = self._now_s()
+            self._holds = [*self._holds[-50:], hold]
         try:
             yield
         finally:
-            with self._lock:
-                self._held -= 1
-                if self._held == 0:
-                    self._holds = [*self._holds[-50:], (self._held_since_s, self._now_s())]
+            hold[1] = self._now_s()
 
     def longest_s(self, _now_s: float) -> float:
         """Return the longest exposure time that a frame may have."""
@@ -156,7 +159,7 @@ class AutoExposure:
         amounts_s, s = self._amounts_s, self._settings
         before_s = amounts_s.get(frame - 1, self._exposure_s)
         seen = frame - s.lag_frames
-        if seen < 0 or self._is_held(begin_s):
+        if seen < 0 or any(since_s <= begin_s < until_s for since_s, until_s in self._holds):
             return before_s
         seen_s = begin_s - s.lag_frames * period_s
         seen_with_s = amounts_s.get(seen, before_s)
@@ -164,11 +167,6 @@ class AutoExposure:
         mean_dn = float(np.clip(self._metered(seen_s) * brightness, 0.5, 255.0).mean())
         step: float = min(max((s.target_dn / mean_dn) ** s.share, 1 / MOST_STEP), MOST_STEP)
         return min(max(seen_with_s * step, s.shortest_s), s.longest_s * s.most_gain)
-
-    def _is_held(self, begin_s: float) -> bool:
-        if self._held and begin_s >= self._held_since_s:
-            return True
-        return any(since_s <= begin_s < until_s for since_s, until_s in self._holds)
 
 
 @functools.cache
@@ -178,42 +176,17 @@ def bell() -> Float32:
 
 
 @dataclass(frozen=True)
-class Noise:
-    """The noise of one camera; seed, camera and a frame's sequence number fix every pixel."""
+class Readout:
+    """How one camera reads its sensor; seed, camera and a frame's sequence number fix every pixel's noise.
+
+    The noise's deviation in the dark and what mid grey (128) adds, grey levels, are those of gain 1. With
+    ``colour`` the pixels lie under red, green and blue filters (RGGB), and pictures are (h, w, 3) BGR.
+    """
 
     read_dn: float
     shot_dn: float
     seed: int
     camera: str
-
-    def sigma_dn(self, light: Float32) -> Float32:
-        """Return the standard deviation of each pixel of a noise-free picture, grey levels."""
-        variance = self.read_dn**2 + self.shot_dn**2 / 128 * np.maximum(light, np.float32(0))
-        return np.sqrt(variance, dtype=np.float32)
-
-    def levels(self, light: Float32, sigma_dn: Float32, sequence: int) -> Image:
-        """Return the picture (h, w) of frame ``sequence`` in whole grey levels."""
-        words = np.random.SeedSequence([self.seed, zlib.crc32(self.camera.encode()), sequence])
-        image: Image = np.empty(light.shape, dtype=np.uint8)
-        kernels.noisy_levels(
-            np.ascontiguousarray(light).ravel(),
-            np.ascontiguousarray(sigma_dn).ravel(),
-            bell(),
-            words.generate_state(1, np.uint64)[0],
-            image.reshape(-1),
-        )
-        return image
-
-
-@dataclass(frozen=True)
-class Readout:
-    """How one camera reads its sensor: with its noise at gain 1.
-
-    With ``colour`` its pixels lie under red, green and blue filters (RGGB), and its pictures are (h, w, 3)
-    BGR.
-    """
-
-    noise: Noise
     colour: bool = False
     jpeg_quality: int = 0
     _kept: list[tuple[Float32, FrameExposure, Float32, Float32]] = field(default_factory=list, repr=False)
@@ -221,8 +194,16 @@ class Readout:
     def picture(self, light: Float32, sequence: int, shot: FrameExposure) -> Image:
         """Return frame ``sequence``, uint8 (h, w) or (h, w, 3) BGR, of the light (h, w) on the sensor."""
         levels, sigma_dn = self._levels(light, shot)
-        raw = self.noise.levels(levels, sigma_dn, sequence)
-        image = self._demosaiced(raw) if self.colour else raw
+        state = np.random.SeedSequence([self.seed, zlib.crc32(self.camera.encode()), sequence])
+        raw: Image = np.empty(levels.shape, dtype=np.uint8)
+        kernels.noisy_levels(
+            np.ascontiguousarray(levels).ravel(),
+            np.ascontiguousarray(sigma_dn).ravel(),
+            bell(),
+            state.generate_state(1, np.uint64)[0],
+            raw.reshape(-1),
+        )
+        image = _demosaiced(raw) if self.colour else raw
         if not self.jpeg_quality:
             return image
         _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self.jpeg_quality])
@@ -237,21 +218,20 @@ class Readout:
         levels = light if shot.factor == 1.0 else light * np.float32(shot.factor)
         if self.colour:
             levels = levels * _filters(levels.shape[0], levels.shape[1])
-        noise = self.noise
-        if shot.gain != 1.0:
-            noise = replace(noise, read_dn=noise.read_dn * shot.gain, shot_dn=noise.shot_dn * shot.gain**0.5)
-        sigma_dn = noise.sigma_dn(levels)
+        read_dn, shot_dn = self.read_dn * shot.gain, self.shot_dn * shot.gain**0.5
+        variance = read_dn**2 + shot_dn**2 / 128 * np.maximum(levels, np.float32(0))
+        sigma_dn = np.sqrt(variance, dtype=np.float32)
         self._kept.clear()
         if not light.flags.writeable:  # a head at rest gives the same array again and again
             self._kept.append((light, shot, levels, sigma_dn))
         return levels, sigma_dn
 
-    @staticmethod
-    def _demosaiced(raw: Image) -> Image:
-        """Colour of each pixel from the filters around it, with red and blue brought up to green."""
-        blue_green_red = cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2BGR).astype(np.float32)
-        balanced: Image = np.rint(np.clip(blue_green_red / SEEN[::-1], 0, 255)).astype(np.uint8)
-        return balanced
+
+def _demosaiced(raw: Image) -> Image:
+    """Colour of each pixel from the filters around it, with red and blue brought up to green."""
+    blue_green_red = cv2.cvtColor(raw, cv2.COLOR_BayerRGGB2BGR).astype(np.float32)
+    balanced: Image = np.rint(np.clip(blue_green_red / SEEN[::-1], 0, 255)).astype(np.uint8)
+    return balanced
 
 
 def _filters(height: int, width: int) -> Float32:
