@@ -26,8 +26,8 @@ from drivers.faults import PAN_TILT
 from drivers.frame_times import MOST_OFFSET_S
 from drivers.hardware import DeviceSettings, HardwareSettings, is_hardware
 from drivers.registry import Kind
+from mastctl.devices.judge import LEAST_CONE_RAD, SUN, WIDEST_CONE_RAD, Limits, SunDirection, direction_of
 from mastctl.devices.keep_out import Box
-from mastctl.devices.limits import LEAST_CONE_RAD, SUN, WIDEST_CONE_RAD, Limits, SunDirection, direction_of
 from mastctl.motion.settings import TrackingSettings
 from mastctl.packaged import default_config
 from mastctl.recorder.settings import RecordSettings

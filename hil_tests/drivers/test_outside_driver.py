@@ -20,7 +20,7 @@ from drivers.open_hardware import halt_head, open_hardware
 from drivers.registry import installed_drivers
 from mastctl.answers import PointingResult, Step
 from mastctl.devices.devices import Devices
-from mastctl.devices.limits import Limits
+from mastctl.devices.judge import Limits
 from mastctl.motion.loop import PointingLoop
 from mastctl.motion.requests import PixelTarget, PointRequest
 from mastctl.motion.settings import PointingSettings

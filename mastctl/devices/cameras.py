@@ -10,9 +10,10 @@ import logging
 import math
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -21,40 +22,211 @@ from calib.geometry.mode import SensorMode
 from calib.geometry.rig import Rig, RigCamera
 from drivers.absent import AbsentCamera
 from drivers.clock import Clock
-from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame
+from drivers.errors import BadFrame, BadReply, BadSetting, DriverError, NoFreshFrame
 from drivers.frame_times import Offset, Pace, Pairing, learned
-from drivers.interfaces import Camera, Frame, FrameTime, Reading
+from drivers.interfaces import SETTINGS, Camera, CameraSetting, Frame, FrameTime, Reading
 from mastctl.control.machine import StandingFault
 from mastctl.devices import frames as frame_checks
-from mastctl.devices.camera_settings import CameraControls
-from mastctl.devices.frames import KEPT_FRAMES, REQUESTED, FrameStore, StampedFrame
+from mastctl.devices.frames import KEPT_FRAMES, REQUESTED, FrameStore, StampedFrame, check_known
 from mastctl.devices.joint_history import JointHistory
-from mastctl.devices.thread import CallFault, Check, DeviceThread, ThreadCall
-from mastctl.errors import NoLonger
+from mastctl.devices.thread import Check, DeviceThread, ThreadCall
+from mastctl.errors import NoLonger, NotNow
+
+HOLD_TIMEOUT_S = 3.0  # a driver waits up to 2 s for changes under way to show
+SET_TIMEOUT_S = 2.0
+
+
+class CameraControls:
+    """The settings of all cameras, changed between operations; safe from any thread.
+
+    ``cameras`` and ``threads`` may get other entries later. ``clock`` stamps the faults.
+    """
+
+    def __init__(
+        self, cameras: Mapping[str, Camera], threads: Mapping[str, DeviceThread], clock: Clock
+    ) -> None:
+        self._cameras = cameras
+        self._threads = threads
+        self._clock = clock
+        self._holds = Counter[str]()  # of each camera, counted in its own thread
+        self._refocused: Mapping[str, _Refocused] = {}  # replaced, never edited
+
+    def of(self, name: str) -> tuple[list[CameraSetting], bool]:
+        """Return what a camera is set to, and whether an operation keeps it; empty if nothing can change.
+
+        Raises NotKnown; NoReply, BadReply, DriverError if the camera does not answer within 2 s.
+        """
+        check_known(name, self._cameras)
+        return self._threads[name].call("settings", lambda: self._read(name), SET_TIMEOUT_S, noted=False)
+
+    def change(self, name: str, wanted: Mapping[str, float]) -> list[str]:
+        """Change some of a camera's settings; return a sentence for each that became another than wanted.
+
+        Raises BadSetting: for one that it lacks, cannot change, or that is out of its bounds; nothing has
+        changed then, but what the sentence names; NotNow ``busy`` if an operation keeps them; else as `of`.
+        """
+        check_known(name, self._cameras)
+
+        def change() -> list[str]:
+            if self._holds[name]:
+                why = "an operation compares its pictures and holds its settings; wait for it or stop it"
+                raise NotNow("busy", f"{name}: {why}")
+            before, _ = self._read(name)
+            changes = check_wanted(before, wanted, name)
+            try:
+                notes = [str(note) for note in self._cameras[name].adjust(changes)]
+            except BaseException:
+                with suppress(Exception):  # the first error counts
+                    self._note_focus(name, wanted, before)
+                raise
+            self._note_focus(name, wanted, before)
+            return notes
+
+        return self._threads[name].call("adjust", change, SET_TIMEOUT_S, noted=False)
+
+    def hold(self, name: str) -> Callable[[], None]:
+        """Keep a camera's exposure and settings as they are; return what ends that.
+
+        Both ends are queued in the camera's own thread, and no caller waits for them. The beginning comes
+        before every image that is taken after it, the end after the beginning, however late that is. So a
+        camera that hangs or refuses keeps no operation waiting; its fault says so.
+        """
+        context: list[AbstractContextManager[None]] = []
+        begun: list[bool] = []
+
+        def enter() -> None:
+            begun.append(True)
+            self._holds[name] += 1
+            one = self._cameras[name].exposure_held()
+            one.__enter__()
+            context.append(one)
+
+        def leave() -> None:
+            self._holds[name] -= len(begun)
+            if context:
+                context.pop().__exit__(None, None, None)
+
+        def release() -> None:
+            with suppress(DriverError):  # closed, and with it the camera
+                self._threads[name].submit("release_exposure", leave, HOLD_TIMEOUT_S, anyway=True)
+
+        try:
+            self._threads[name].submit("hold_exposure", enter, HOLD_TIMEOUT_S)
+        except DriverError:  # overdue or closed: its fault says so already, and it takes no images
+            return lambda: None
+        return release
+
+    def calibrated(self) -> None:
+        """Treat the focus that each camera has now as that of the mast file, which came into use."""
+        self._refocused = {}
+
+    def faults(self) -> list[StandingFault]:
+        """Return a fault for each camera that has another focus than it was calibrated with."""
+        return [
+            StandingFault(
+                name,
+                "refocused",
+                f"{name}: its focus is {one.now:g} and was {one.calibrated:g} when the mast file came into "
+                "use; the calibration is not of this focus",
+                one.since_s,
+                f"its focus is {one.calibrated:g} again, or another mast file is in use",
+            )
+            for name, one in self._refocused.items()
+        ]
+
+    def _read(self, name: str) -> tuple[list[CameraSetting], bool]:
+        """In the camera's thread: what it states, if that can be."""
+        return [_checked(one, name) for one in self._cameras[name].settings()], self._holds[name] > 0
+
+    def _note_focus(self, name: str, wanted: Mapping[str, float], before: Sequence[CameraSetting]) -> None:
+        """Compare a focus that was to be changed with that of before its first change."""
+        if "focus" not in wanted:
+            return
+        had = next((one.value for one in before if one.name == "focus"), None)
+        now = next((one.value for one in self._read(name)[0] if one.name == "focus"), None)
+        former = self._refocused.get(name)
+        calibrated = former.calibrated if former is not None else had
+        others = {key: one for key, one in self._refocused.items() if key != name}
+        if calibrated is None or now is None or now == calibrated:
+            self._refocused = others
+        else:
+            since_s = self._clock.now_s() if former is None else former.since_s
+            self._refocused = {**others, name: _Refocused(calibrated, now, since_s)}
+
+
+@dataclass(frozen=True)
+class _Refocused:
+    """The focus that a camera was calibrated with, the one that it has, and since when it is not that."""
+
+    calibrated: float
+    now: float
+    since_s: float
+
+
+def _checked(one: object, camera: str) -> CameraSetting:
+    """What a driver states of a setting, its numbers as Python's own. Raises BadReply for what cannot be."""
+    if not isinstance(one, CameraSetting) or one.name not in SETTINGS:
+        name = getattr(one, "name", type(one).__name__)
+        expected = f"where one of {', '.join(SETTINGS)} is expected"
+        raise BadReply(f"settings returned {name!r} {expected}", device=camera)
+    try:
+        low, high, step = map(frame_checks.number, (one.minimum, one.maximum, one.step))
+        value = None if one.value is None else frame_checks.number(one.value)
+        if not (
+            low <= high and step >= 0 and isinstance(one.automatic, bool) and isinstance(one.refusal, str)
+        ):
+            raise ValueError("minimum <= maximum, a step of 0 or more, a truth value and a text are expected")
+    except (TypeError, ValueError) as error:
+        found = f"settings returned {one.name} with {one!r:.300}: {error}"
+        raise BadReply(found, device=camera) from None
+    return replace(one, minimum=low, maximum=high, step=step, value=value)
+
+
+def check_wanted(
+    known: Sequence[CameraSetting], wanted: Mapping[str, float], camera: str
+) -> dict[str, float]:
+    """Return settings that a camera has, can change, and that are within its bounds. Raises BadSetting.
+
+    Bounds are shown with six digits, and one that comes back so is the bound.
+    """
+    has = {one.name: one for one in known}
+    found: dict[str, float] = {}
+    for name, value in wanted.items():
+        if name not in has:
+            known_ones = f"it has {', '.join(has)}" if has else "nothing of it can be changed while it runs"
+            raise BadSetting(f"it has no {name}; {known_ones}", device=camera)
+        one, unit = has[name], SETTINGS[name] and f" {SETTINGS[name]}"
+        if one.refusal:
+            raise BadSetting(f"{name} {one.refusal}", device=camera)
+        low, high = f"{one.minimum:g}", f"{one.maximum:g}"
+        if not min(float(low), one.minimum) <= value <= max(float(high), one.maximum):
+            message = f"{name} is to be {value:g}{unit}, {low} to {high}{unit} is expected"
+            raise BadSetting(message, device=camera)
+        found[name] = min(max(value, one.minimum), one.maximum)
+    return found
+
 
 log = logging.getLogger(__name__)
 
 READINGS_S = 1.0  # for the head's readings to reach beyond an exposure
 SIZE_TIMEOUT_S = 1.0
 CAMERA_GRACE_S = 3.0  # beyond the time given to next_frame: copying and decoding on a busy machine
-GLANCES_SHARE = 0.1  # of real time that glances may keep a simulation's clock from going on
+WATCHED_SHARE = 0.1  # of real time that watched frames may keep a simulation's clock from going on
 NOT_COMPARED = "%s; the camera is used, and not compared with the mast file in this"
 MOVED_RAD = 1e-5  # a head camera's image that stays the same to the last bit beyond this is frozen
 FAULTS = {
-    "next_frame": CallFault("a picture comes"),
-    "recent_times": CallFault("a pair of pictures comes"),
-    "hold_exposure": CallFault("an operation can hold the exposure again"),
-    "release_exposure": CallFault("an operation has held and released the exposure again"),
+    "next_frame": "a picture comes",
+    "recent_times": "a pair of pictures comes",
+    "hold_exposure": "an operation can hold the exposure again",
+    "release_exposure": "an operation has held and released the exposure again",
 }
 
 
 class Cameras:
     """The cameras behind their threads: the part of `mastctl.devices.devices.Devices` that takes images.
 
-    ``settings``: the settings of each; ``sensor_modes``: which pixels of its sensor each camera's images
-    show, of those that are open and know it.
-
-    Raises BadFrame if a camera that knows its size, or its sensor's mode, has another than the mast file's.
+    ``sensor_modes`` says which pixels of its sensor each camera's images show, of those that are open and
+    know it. Raises BadFrame if a camera that knows its size, or its sensor's mode, has not the mast file's.
     """
 
     def __init__(
@@ -86,8 +258,8 @@ class Cameras:
         self._learned: dict[tuple[str, str], Offset] = {}
         self._still_since: dict[str, StampedFrame] = {}  # per camera the first frame of the same content
         self._stamping = {name: threading.Lock() for name in self._cameras}
-        self._glancing = threading.Lock()
-        self._glance_from_s = 0.0  # of real time
+        self._watching = threading.Lock()
+        self._watch_from_s = 0.0  # of real time
         self._threads.update({name: self._thread_of(name) for name in self._cameras})
         if rig is not None:
             self._check_sizes()
@@ -99,19 +271,18 @@ class Cameras:
         timeout_s: float,
         check: Check | None = None,
     ) -> dict[str, StampedFrame]:
-        """Return one frame of each camera, taken in parallel, with its facts.
+        """Return one frame of each camera, taken in parallel, in the order of the names, with its facts.
 
         Frames of several cameras belong together (`drivers.frame_times`): exposed at one trigger, or nearest
         in time. Each serves one such set. All are ``moving`` if the head moved at any time from the first
         exposure to the end of the last.
 
-        ``exposed_after_s``: only frames whose exposure began after this moment count, seconds of
-        CLOCK_MONOTONIC; ``timeout_s``: what each camera is given, seconds; the call itself ends at most the
-        grace and 1 s later; ``check``: called while frames are waited for; what it raises ends the wait.
+        Every exposure began after ``exposed_after_s``, seconds of CLOCK_MONOTONIC. Each camera is given
+        ``timeout_s``; the call ends at most the grace and 1 s later. ``check`` is called while frames are
+        waited for; what it raises ends the wait.
 
-        Raises NotKnown ``unknown_camera`` if a name is not configured; NoFreshFrame, BadFrame, NoReply,
-        DriverError if a camera did not deliver, or none that belong together; the first in the order of the
-        names; BadReply if the head's readings do not reach around an exposure.
+        Raises NotKnown ``unknown_camera``; NoFreshFrame, BadFrame, NoReply, DriverError of the first camera
+        that did not deliver; BadReply if the head's readings do not reach around an exposure.
         """
         for camera in cameras:
             frame_checks.check_known(camera, self._cameras)
@@ -132,19 +303,17 @@ class Cameras:
         self._paired_s |= {name: frame.exposure_began_s for name, frame in frames.items()}
         return self._together({name: self._stamped(name, frame) for name, frame in frames.items()})
 
-    def glance(self, camera: str, exposed_after_s: float, max_age_s: float, timeout_s: float) -> StampedFrame:
-        """Return a frame of one camera that is only watched: it is not published.
+    def watched_frame(
+        self, camera: str, exposed_after_s: float, max_age_s: float, timeout_s: float
+    ) -> StampedFrame:
+        """Return a frame of one camera for those that only watch: it is not published.
 
-        One that an operation took serves, if it is new enough. A clock that stands while an image is made is
-        kept from going on for `GLANCES_SHARE` of real time at most. Not for a thread at work on such a clock.
-
-        ``exposed_after_s``, ``max_age_s``: the exposure began after that moment of CLOCK_MONOTONIC, and at
-        most so long ago, seconds.
-
-        Raises NoFreshFrame, BadFrame, NoReply, DriverError, BadReply: as `frames`.
+        Its exposure began after that moment of CLOCK_MONOTONIC, and at most so long ago, seconds. One that an
+        operation took serves. A clock that stands while an image is made is kept from going on for
+        `WATCHED_SHARE` of real time at most. Not for a thread at work on such a clock. Raises as `frames`.
         """
 
-        def glanced() -> StampedFrame:
+        def watched() -> StampedFrame:
             after_s = max(exposed_after_s, self._clock.now_s() - max_age_s)
             newest = self._store.newest(camera)
             if newest is not None and newest.exposure_began_s > after_s:
@@ -154,21 +323,18 @@ class Cameras:
             return self._stamped(camera, frames[camera], published=False)
 
         if not self._clock.stands_for_work:
-            return glanced()
-        with self._glancing:
-            time.sleep(max(0.0, self._glance_from_s - time.monotonic()))
+            return watched()
+        with self._watching:
+            time.sleep(max(0.0, self._watch_from_s - time.monotonic()))
             began_s = time.monotonic()
             try:
-                return glanced()
+                return watched()
             finally:
                 ended_s = time.monotonic()
-                self._glance_from_s = ended_s + (ended_s - began_s) * (1.0 / GLANCES_SHARE - 1.0)
+                self._watch_from_s = ended_s + (ended_s - began_s) * (1.0 / WATCHED_SHARE - 1.0)
 
     def frame_by_id(self, frame_id: str, max_age_s: float | None = None) -> StampedFrame:
-        """Return a frame that is still kept.
-
-        Raises NotKnown ``frame_unknown``, NoLonger ``frame_too_old``, NotNow ``other_mast_file``.
-        """
+        """Return a kept frame, not older than so. Raises as `mastctl.devices.frames.FrameStore.by_id`."""
         frame = self._store.by_id(frame_id)
         age_s = self._clock.now_s() - frame.mid_exposure_s
         if max_age_s is not None and age_s > max_age_s:
@@ -193,7 +359,7 @@ class Cameras:
     def exposure_held(self) -> Iterator[None]:
         """Keep every camera's exposure as it is inside the block: a measurement compares its images.
 
-        Nothing is waited for; see `mastctl.devices.camera_settings`.
+        Nothing is waited for (`CameraControls.hold`).
         """
         releases = [self.settings.hold(name) for name in self._threads]
         try:
@@ -225,7 +391,7 @@ class Cameras:
         """The thread of a camera; that of an absent one opens it when it comes; its absence is a fault."""
         if not isinstance(self._cameras[camera], AbsentCamera):
             return DeviceThread(camera, faults=FAULTS, clock=self._time)
-        faults = {**FAULTS, "next_frame": CallFault("it is there, or a picture comes")}
+        faults = {**FAULTS, "next_frame": "it is there, or a picture comes"}
         return DeviceThread(
             camera,
             between=lambda: self._join(camera),

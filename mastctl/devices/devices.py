@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 from calib.geometry.rig import JointErrors, Rig
@@ -19,18 +19,91 @@ from drivers.clock import Clock, deadlines_on
 from drivers.errors import BadReply, DriverError, LineLost, NoReply
 from drivers.interfaces import COARSE_COUNT_RAD, AxisReport, Camera, PanTilt
 from drivers.options import is_number
-from mastctl.control.machine import StandingFault, StateMachine
+from mastctl.control.machine import StandingFault, StateMachine, same_faults
 from mastctl.devices import joint_history
 from mastctl.devices.cameras import Cameras
-from mastctl.devices.fault_watch import FaultWatch
 from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.devices.joint_history import HeadReading, JointHistory
-from mastctl.devices.judge import REST_S, KeepOutJudge
+from mastctl.devices.judge import REST_S, KeepOutJudge, Limits, SunDirection
 from mastctl.devices.keep_out import Pair
-from mastctl.devices.limits import Limits, SunDirection
-from mastctl.devices.stops import AT_ONCE_S, PATIENCE_S, StopRequests
-from mastctl.devices.thread import CallFault, DeviceThread
+from mastctl.devices.thread import AT_ONCE_S, PATIENCE_S, DeviceThread, StopRequests
 from mastctl.errors import MastctlError, Stopped
+
+ENDS_S = 1.0
+WATCH_S = 0.1  # a call is overdue by the clock alone; so late that may show
+
+
+class FaultWatch:
+    """Publishes what is wrong with each device or file, and informs the machine of the head's faults.
+
+    ``faults`` returns what is wrong with any device now; it must not wait, nor may what `also` gets. Each
+    change is published as ``("fault", device, tuple)``.
+    """
+
+    def __init__(
+        self, faults: Callable[[], Sequence[StandingFault]], head: str, machine: StateMachine, clock: Clock
+    ) -> None:
+        self._sources: tuple[Callable[[], Sequence[StandingFault]], ...] = (faults,)
+        self._head = head
+        self._machine = machine
+        self._published: dict[str, tuple[StandingFault, ...]] = {}
+        self._lock = threading.Lock()
+        self._changed = clock.signal()
+        self._begun = self._closed = False
+        self._thread = clock.thread(self._work, "faults")
+
+    def also(self, faults: Callable[[], Sequence[StandingFault]]) -> None:
+        """Watch another source from now on: the daemon's own files."""
+        self._sources = (*self._sources, faults)
+
+    def now(self) -> tuple[StandingFault, ...]:
+        """Return all that is wrong now, and publish what has changed."""
+        self.check()
+        return tuple(fault for faults in self._sources for fault in faults())
+
+    def begin(self) -> None:
+        """Watch from now on: ``faults`` can be called."""
+        self._begun = True
+        self._thread.start()
+
+    def check(self) -> None:
+        """Publish what has changed; a check that is under way is not waited for."""
+        if self._begun and self._lock.acquire(blocking=False):
+            try:
+                self._compare()
+            finally:
+                self._lock.release()
+
+    def close(self) -> None:
+        """Check once more, and end the thread."""
+        self.check()
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._thread.join(ENDS_S)
+
+    def _work(self) -> None:
+        while True:
+            with self._changed:
+                if not self._closed:
+                    self._changed.wait(WATCH_S, idle=True)
+                if self._closed:
+                    return
+            self.check()
+
+    def _compare(self) -> None:
+        by_device: dict[str, list[StandingFault]] = {}
+        for fault in (one for faults in self._sources for one in faults()):
+            by_device.setdefault(fault.device, []).append(fault)
+        for device in {*self._published, *by_device}:
+            now = tuple(by_device.get(device, ()))
+            if same_faults(now, self._published.get(device, ())):
+                continue
+            self._published[device] = now
+            self._machine.publisher.publish("fault", device, now)
+            if device == self._head:
+                self._machine.head_faults(now)
+
 
 log = logging.getLogger(__name__)
 
@@ -42,8 +115,8 @@ CLOSE_S = 2.0
 MOVING_PERIOD_S = 0.02
 RESTING_PERIOD_S = 0.05
 FAULTS = {
-    "read": CallFault("the head is read again"),
-    "move": CallFault("a later move is taken in time", late_is_fault=True),
+    "read": "the head is read again",
+    "move": "a later move is taken in time",
 }
 
 
@@ -70,14 +143,9 @@ class Devices(Cameras):
     clock
         Stamps are judged against it; deadlines run on it too, or in real time if it is turned by hand.
     rig
-        The mast file's content: image sizes, and which cameras ride on the head. Without it sizes are
-        not checked and no camera is declared frozen.
+        The mast file's content; without it image sizes are not checked and no camera is declared frozen.
     camera_grace_s
-        How long past its time a camera may take before it counts as hanging, seconds; 3 by default.
-    new_run
-        As in `mastctl.devices.frames.FrameStore`.
-    sun
-        What the head cameras must not see at first.
+        How long past its time a camera may take before it hangs, seconds; `CAMERA_GRACE_S` by default.
     machine
         Gets whether the head moves and what is wrong with it; its publisher each reading, each frame's facts
         and each device's faults. One of its own by default.
@@ -86,10 +154,6 @@ class Devices(Cameras):
     ----------
     on_turn
         Called in the head's own thread each time it is about to read, whatever comes of that; must not wait.
-    judge
-        What judges the moves, by limits, keep-outs and the sun.
-    fault_watch
-        Publishes each change of what is wrong; of the daemon's own files too.
     temperatures_c
         Of the axes, replaced and never edited.
 
@@ -130,7 +194,12 @@ class Devices(Cameras):
         )
         self.fault_watch = FaultWatch(self._faults, HEAD, self._machine, deadlines)
         self._head = DeviceThread(
-            HEAD, between=self._poll, between_timeout_s=READ_TIMEOUT_S, faults=FAULTS, clock=deadlines
+            HEAD,
+            between=self._poll,
+            between_timeout_s=READ_TIMEOUT_S,
+            faults=FAULTS,
+            moves="move",
+            clock=deadlines,
         )
         patience_s = AT_ONCE_S if self._pan_tilt.info.stops_beside is True else PATIENCE_S
         self._stops = StopRequests(self._head, HEAD, lambda: self._pan_tilt.stop(), deadlines, patience_s)
@@ -180,9 +249,9 @@ class Devices(Cameras):
     def goal(self, true_rad: Pair, start: HeadReading) -> Pair:
         """Return the readings to send a head to that rests at ``start``, so that it comes to true angles.
 
-        By the mast file's joints. The side from which each axis will come follows from where it is, and from
-        whether the head comes to its goals from one side by itself. Nearer than half the play to where that
-        side changes no goal leads to the angle: the one returned leads past it, by the play at most.
+        The side from which each axis will come follows from where it is, and from whether the head comes to
+        its goals from one side by itself. Nearer than half the play to where that side changes no goal leads
+        to the angle: the one returned leads past it, by the play at most.
         """
         pan, tilt = (
             joint.goal_rad(wanted, read, came, turn)
@@ -200,10 +269,9 @@ class Devices(Cameras):
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         """Start the head towards angles that it is to read, radians, and return; at most at the speed cap.
 
-        Raises OutsideLimits, KeptOut if an angle or the speed may not be commanded, or the head might pass a
-        keep-out on its way; Stopped if a stop came first, moves are blocked, or a stop has not come back from
-        the driver yet; nothing was sent then. Raises NoReply, DriverError if the head does not take the
-        command in 1 s.
+        Raises OutsideLimits, KeptOut; Stopped if a stop came first, moves are blocked, or a stop has not come
+        back from the driver yet; nothing was sent then. Raises NoReply, DriverError if the head does not take
+        the command in 1 s.
         """
         ticket = self._stops.ticket()
         goal = float(pan_rad), float(tilt_rad)
@@ -233,8 +301,7 @@ class Devices(Cameras):
         self.judge.check_from(start, goal)
 
     def stop(self) -> None:
-        """Halt the head at once, whatever hangs (`mastctl.devices.stops`); moves still waiting are never
-        sent.
+        """Halt the head at once, whatever hangs; moves still waiting are never sent.
 
         Raises NoReply, DriverError if the head did not confirm within 1 s; it may still move.
         """
@@ -244,7 +311,7 @@ class Devices(Cameras):
             self._stop_lost = True
             raise
         finally:
-            self.fault_watch.look()
+            self.fault_watch.check()
 
     def stops_returned(self, timeout_s: float) -> bool:
         """Return whether every stop has come back from the driver within ``timeout_s`` seconds."""
@@ -278,7 +345,7 @@ class Devices(Cameras):
 
     def faults(self) -> tuple[StandingFault, ...]:
         """Return what is wrong with any device now, what the head reports about itself included."""
-        self.fault_watch.look()
+        self.fault_watch.check()
         return self._faults()
 
     def _faults(self) -> tuple[StandingFault, ...]:

@@ -1,8 +1,8 @@
-"""Frames with their facts: what an image shows is worth little without when, where and by which mast file.
+"""Frames with their facts, and those that are kept, found again by id.
 
 A frame's id is ``<camera>-<sequence>-<mast>-<run>``: the last two are the first 8 digits of the mast file's
 digest and a token of this run of the camera, so that an id kept from yesterday, or from before the mast
-file changed, never names another image. Clients take ids as opaque.
+file changed, never names another image. Clients treat ids as opaque.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import secrets
 import threading
-from collections import Counter, OrderedDict, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 
@@ -101,16 +101,14 @@ def checked(
 ) -> Frame:
     """Return a driver's answer to ``next_frame`` if it can be true and was exposed after a moment.
 
-    ``size_px`` is (width, height) by the mast file, None if not known. Times are of CLOCK_MONOTONIC.
-
-    Raises BadFrame if it is no frame, of another size, dark, saturated, or stamped in the future;
-    NoFreshFrame if its exposure began too early.
+    ``size_px`` is (width, height) by the mast file, None if not known. Raises BadFrame if it is no frame, of
+    another size, dark, saturated, or stamped in the future; NoFreshFrame if its exposure began too early.
     """
     try:
         image = answer.image  # type: ignore[attr-defined]
         sequence = _whole(answer.sequence)  # type: ignore[attr-defined]
-        mid_s = _number(answer.mid_exposure_s)  # type: ignore[attr-defined]
-        exposure_s = _number(answer.exposure_s)  # type: ignore[attr-defined]
+        mid_s = number(answer.mid_exposure_s)  # type: ignore[attr-defined]
+        exposure_s = number(answer.exposure_s)  # type: ignore[attr-defined]
     except (AttributeError, TypeError, ValueError) as reason:
         message = f"next_frame returned {type(answer).__name__} that is not a frame: {reason}"
         raise BadFrame(message, device=camera) from None
@@ -152,7 +150,7 @@ def checked(
 
 
 def random_run() -> str:
-    """Return four hexadecimal digits that tell a run of the service from those before it."""
+    """Return four hexadecimal digits that tell a run from those before it."""
     return secrets.token_hex(2)
 
 
@@ -163,25 +161,21 @@ class _Kept:
     """
 
     def __init__(self) -> None:
-        self._frames: dict[tuple[str, str], OrderedDict[str, StampedFrame]] = {}
-        self._order: OrderedDict[tuple[tuple[str, str], str], None] = OrderedDict()  # of those that watch
-        self._watchers: Counter[str] = Counter()  # how many of them keep a frame
-        self._bytes = 0
+        self._frames: dict[tuple[str, str], dict[str, StampedFrame]] = {}
+        self._watched: dict[tuple[tuple[str, str], str], int] = {}  # bytes of (place, frame), oldest first
 
     def add(self, by: str, frame: StampedFrame, most: int) -> None:
         """Keep a frame as the newest of its camera, of which a holder has so many."""
         place, name = (by, frame.camera), frame.frame_id
         self._remove(place, name)
-        frames = self._frames.setdefault(place, OrderedDict())
+        frames = self._frames.setdefault(place, {})
         frames[name] = frame
         if by not in (REQUESTED, OPERATIONS):
-            self._order[place, name] = None
-            self._bytes += 0 if self._watchers[name] else frame.image.nbytes
-            self._watchers[name] += 1
+            self._watched[place, name] = frame.image.nbytes
         while len(frames) > most:
             self._remove(place, next(iter(frames)))
-        while self._bytes > WATCHED_BYTES and len(self._order) > 1:
-            self._remove(*next(iter(self._order)))
+        while len(self._watched) > 1 and self._bytes() > WATCHED_BYTES:
+            self._remove(*next(iter(self._watched)))
 
     def get(self, frame_id: str) -> StampedFrame | None:
         """Return a kept frame by its id."""
@@ -194,18 +188,14 @@ class _Kept:
                 self._remove(place, frame_id)
 
     def _remove(self, place: tuple[str, str], frame_id: str) -> None:
-        frames = self._frames.get(place)
-        if frames is None or frame_id not in frames:
-            return
-        frame = frames.pop(frame_id)
+        self._watched.pop((place, frame_id), None)
+        frames = self._frames.get(place, {})
+        frames.pop(frame_id, None)
         if not frames:
-            del self._frames[place]
-        if (place, frame_id) in self._order:
-            del self._order[place, frame_id]
-            self._watchers[frame_id] -= 1
-            if not self._watchers[frame_id]:
-                del self._watchers[frame_id]
-                self._bytes -= frame.image.nbytes
+            self._frames.pop(place, None)
+
+    def _bytes(self) -> int:
+        return sum({name: size for (_, name), size in self._watched.items()}.values())
 
 
 class FrameStore:
@@ -240,9 +230,9 @@ class FrameStore:
         return f"{camera}-{sequence:06d}-{digest[:8]}-{run}", digest
 
     def change_mast(self, mast_digest: str) -> None:
-        """Forget every frame and name the coming ones by another mast file.
+        """Forget every frame and name the coming ones by another mast file, and as a new run.
 
-        The run is a new one too: a frame from before must not be found again after a change and back.
+        A frame from before must not be found again after a change and back.
         """
         with self._lock:
             self._digest = mast_digest
@@ -260,7 +250,7 @@ class FrameStore:
             self._runs[camera] = self._new_run()
 
     def add(self, frame: StampedFrame, published: bool = True) -> StampedFrame:
-        """Keep a frame and return it; if a frame of that id is kept already, that one is returned.
+        """Keep a frame and return it, or the one of that id that is kept already.
 
         One that is only watched is not ``published``, and so not recorded.
         """
@@ -358,13 +348,13 @@ def _settings(answer: object) -> dict[str, float | None]:
     for name in SETTINGS:
         if isinstance(stated, Mapping) and name in stated:
             try:
-                known[name] = _number(stated[name])
+                known[name] = number(stated[name])
             except (TypeError, ValueError):
                 known[name] = None
     return known
 
 
-def _number(value: object) -> float:
+def number(value: object) -> float:
     """Return a finite float, refusing what only looks like one."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
         raise TypeError(f"{type(value).__name__} where a number is expected")

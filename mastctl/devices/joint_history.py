@@ -36,11 +36,10 @@ Interval = tuple[float, float]
 
 @dataclass(frozen=True)
 class HeadReading(Reading):
-    """A reading of the head, and its true angles.
+    """A reading of the head, and its true angles (pan, tilt) by the mast file's joints.
 
-    ``true_rad``: (pan, tilt) by the mast file's joints; ``approach``: for pan and tilt, from which side the
-    axis came: 1 from smaller readings, -1 from larger, 0 not known, between them where it has not gone
-    through all of its play since it turned round.
+    ``approach`` says for each axis from which side it came: 1 from smaller readings, -1 from larger, 0 not
+    known, between them where it has not gone through all of its play since it turned round.
     """
 
     true_rad: Pair = field(kw_only=True)
@@ -50,10 +49,9 @@ class HeadReading(Reading):
 def checked(answer: object, device: str, now_s: float, newest_s: float | None) -> Reading:
     """Return a driver's answer to ``read`` as a Reading, if it can be true.
 
-    ``newest_s`` is the stamp of the last good reading, None before it; times are of CLOCK_MONOTONIC.
-
-    Raises BadReply if it is no reading, an angle is not finite or beyond a full turn, or the stamp lies in
-    the future, more than 1 s back, or before the last one.
+    ``newest_s`` is the stamp of the last good reading, None before it. Raises BadReply if it is no reading,
+    an angle is not finite or beyond a full turn, or the stamp lies in the future, more than 1 s back, or
+    before the last one.
     """
     numbers = {}
     for name in ("pan_rad", "tilt_rad", "time_s"):
@@ -98,16 +96,13 @@ class JointHistory:
     """Readings of the last minute, and when moves were sent. Safe to use from any thread.
 
     A head that says now and then that it moves, although its readings are those of a head at rest
-    (`dithers`) and no move was sent for a second, is treated as resting. ``joints`` are the mast file's:
-    what readings are wrong by.
+    (`dithers`) and no move was sent for a second, is treated as resting. ``joints`` are the mast file's.
     """
 
     def __init__(self, joints: JointErrors | None = None) -> None:
         self._joints = joints or JointErrors()
         self._readings: deque[Reading] = deque(maxlen=KEPT_READINGS)  # as the driver gave them
-        self._loads: deque[tuple[Interval, Interval]] = deque(
-            maxlen=KEPT_READINGS
-        )  # and where the loads may be then
+        self._loads = deque[tuple[Interval, Interval]](maxlen=KEPT_READINGS)  # where the loads may be then
         self._newest: HeadReading | None = None  # with what is true of its motion
         self._moves_s: deque[float] = deque(maxlen=200)
         self._lock = threading.Lock()
@@ -132,10 +127,7 @@ class JointHistory:
                 self._follow(reading)
 
     def add(self, reading: Reading) -> HeadReading:
-        """Keep a checked reading and return it with ``moving`` as the class says.
-
-        One of the same time replaces the last.
-        """
+        """Keep a checked reading, in place of one of the same time; return it, ``moving`` as above."""
         with self._lock:
             if self._readings and reading.time_s <= self._readings[-1].time_s:
                 self._readings.pop()
@@ -163,37 +155,28 @@ class JointHistory:
     def at_exposure(self, began_s: float, mid_s: float, ended_s: float, device: str) -> HeadReading:
         """Return the head at mid-exposure, linear between the readings around it.
 
-        The head counts as moving if a move was sent between the last reading before the exposure and the
+        The head is treated as moving if a move was sent between the last reading before the exposure and the
         first one after it, if any of them says so, or if these differ by more than 3 mrad; the last two not
-        of a head that dithers at rest.
-
-        Raises BadReply if the readings do not reach around the exposure, or leave a gap of more than 1 s in
-        it, 10 s at rest.
+        of a head that dithers at rest. Raises BadReply if the readings do not reach around the exposure, or
+        leave a gap of more than 1 s in it, 10 s at rest.
         """
         with self._lock:
             times_s = [reading.time_s for reading in self._readings]
             first = bisect.bisect_right(times_s, began_s) - 1
             last = bisect.bisect_left(times_s, ended_s)
-            around = [self._readings[i] for i in range(max(first, 0), min(last + 1, len(times_s)))]
-            loads = [_middles(self._loads[i]) for i in range(max(first, 0), min(last + 1, len(times_s)))]
+            numbers = range(max(first, 0), min(last + 1, len(times_s)))
+            around = [self._readings[i] for i in numbers]
+            loads = [_middles(self._loads[i]) for i in numbers]
             moves_s = list(self._moves_s)
             rests = bool(around) and self._dithers(around[-1].time_s)
         if first < 0 or last >= len(times_s):
             side = "before" if first < 0 else "after"
             raise BadReply(f"there is no joint reading {side} the frame's exposure", device=device)
-        stamps_s = [reading.time_s for reading in around]
-        pans = [reading.pan_rad for reading in around]
-        tilts = [reading.tilt_rad for reading in around]
-        seems = (
-            any(reading.moving for reading in around)
-            or max(pans) - min(pans) > STILL_RAD
-            or max(tilts) - min(tilts) > STILL_RAD
-        )
+        stamps_s, pans, tilts = zip(*((one.time_s, one.pan_rad, one.tilt_rad) for one in around), strict=True)
+        seems = any(one.moving for one in around) or max(np.ptp(pans), np.ptp(tilts)) > STILL_RAD
         moving = (seems and not rests) or any(stamps_s[0] <= sent_s <= stamps_s[-1] for sent_s in moves_s)
-        gap_s, most_s = (
-            max(np.diff(stamps_s), default=0.0),
-            LARGEST_GAP_S if moving else LARGEST_GAP_AT_REST_S,
-        )
+        gap_s = max(np.diff(stamps_s), default=0.0)
+        most_s = LARGEST_GAP_S if moving else LARGEST_GAP_AT_REST_S
         if gap_s > most_s:
             gap = f"the joint readings around the exposure are {gap_s:.2f} s apart"
             raise BadReply(f"{gap}, at most {most_s:g} s is taken", device=device)
@@ -205,19 +188,14 @@ class JointHistory:
             return HeadReading(*read, moving, mid_s, true_rad=true_rad, approach=approach)
 
     def _plays_rad(self) -> Pair:
-        return (
-            self._joints.pan.backlash_rad or USUAL_PLAY_RAD,
-            self._joints.tilt.backlash_rad or USUAL_PLAY_RAD,
-        )
+        pan, tilt = self._joints.pan.backlash_rad, self._joints.tilt.backlash_rad
+        return pan or USUAL_PLAY_RAD, tilt or USUAL_PLAY_RAD
 
     def _follow(self, reading: Reading) -> None:
         """Note where the loads may be once the head is at a reading; the lock is kept."""
-        pan, tilt = (
-            _taken_along(self._loads[-1][axis] if self._loads else None, at, play)
-            for axis, (at, play) in enumerate(
-                zip((reading.pan_rad, reading.tilt_rad), self._plays_rad(), strict=True)
-            )
-        )
+        before = self._loads[-1] if self._loads else (None, None)
+        read = reading.pan_rad, reading.tilt_rad
+        pan, tilt = map(_taken_along, before, read, self._plays_rad())
         self._loads.append((pan, tilt))
 
     def _approach(self, read: Pair, loads: Pair) -> Approach:
@@ -266,7 +244,7 @@ QUIET_SHARE = 0.25  # of the readings that must say rest; fewer is a head that s
 def dithers(readings: Sequence[Reading], tolerance_rad: float = DITHER_RAD, for_s: float = DITHER_S) -> bool:
     """Return whether a head rests although its readings flicker, or say now and then that it moves.
 
-    ``readings`` are as the driver gave them, oldest first, of which the last ``for_s`` seconds count;
+    ``readings`` are as the driver gave them, oldest first; the last ``for_s`` seconds are judged, and
     ``tolerance_rad`` is how far they may lie from each other.
     """
     window = [one for one in readings if one.time_s >= readings[-1].time_s - for_s]

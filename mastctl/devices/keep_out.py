@@ -16,6 +16,7 @@ from mastctl.errors import BadRequest
 
 Pair = tuple[float, float]
 
+ROOM_PARTS = 32
 TOUCH_RAD = 1e-9  # closer than this is the edge itself
 ASIDE_RAD = 5e-3  # a move along one axis leaves the other where it was read: three counts of a 12-bit servo
 
@@ -69,11 +70,6 @@ class Span:
         )
         return Span(pan, tilt) if pan[0] <= pan[1] and tilt[0] <= tilt[1] else None
 
-    @property
-    def area(self) -> float:
-        """Pan times tilt, rad²."""
-        return (self.pan_rad[1] - self.pan_rad[0]) * (self.tilt_rad[1] - self.tilt_rad[0])
-
     def gap(self, other: Span) -> float:
         """Return how far apart two are: the larger of pan's and tilt's distance, negative if they overlap."""
         pairs = (self.pan_rad, other.pan_rad), (self.tilt_rad, other.tilt_rad)
@@ -81,13 +77,7 @@ class Span:
 
     def enters(self, open_box: Span) -> bool:
         """Return whether any of it lies inside another one, whose edge does not count."""
-        return all(
-            mine[0] < theirs[1] - TOUCH_RAD and mine[1] > theirs[0] + TOUCH_RAD
-            for mine, theirs in (
-                (self.pan_rad, open_box.pan_rad),
-                (self.tilt_rad, open_box.tilt_rad),
-            )
-        )
+        return self.gap(open_box) < -TOUCH_RAD
 
 
 @dataclass(frozen=True)
@@ -119,8 +109,8 @@ class Box:
 class KeepOuts:
     """All boxes of a moment, copies over the whole range of pan included, with a margin around each.
 
-    ``beyond_rad`` is how far the head may pass a goal on purpose, in pan and in tilt. ``pan_rad`` and
-    ``tilt_rad`` are the joint limits: a path out of a box, and a nearest free goal, lie within them.
+    ``beyond_rad`` is how far the head may pass a goal on purpose, in pan and in tilt. A path out of a box,
+    and a nearest free goal, lie within the joint limits ``pan_rad`` and ``tilt_rad``.
     """
 
     boxes: tuple[Box, ...]
@@ -152,29 +142,17 @@ class KeepOuts:
                 raise KeptOut(box.name, f"{_text(goal)} is {where} the {box}{self._slack_text()}")
 
     def room(self, place: Pair, most: Span) -> Span | None:
-        """Return a wide part of ``most`` around a place in it that no keep-out reaches into, or None.
-
-        Each keep-out takes the side away that leaves the most; one that holds the place leaves nothing.
-        """
-        for full in self.full:
-            if not most.enters(full):
-                continue
-            (pan, tilt), (low, high) = place, most.corners
-            sides = [
-                Span.around((max(low[0], full.pan_rad[1]), low[1]), high),
-                Span.around(low, (min(high[0], full.pan_rad[0]), high[1])),
-                Span.around((low[0], max(low[1], full.tilt_rad[1])), high),
-                Span.around(low, (high[0], min(high[1], full.tilt_rad[0]))),
-            ]
-            keeps = (
-                full.pan_rad[1] <= pan, full.pan_rad[0] >= pan,
-                full.tilt_rad[1] <= tilt, full.tilt_rad[0] >= tilt,
-            )  # fmt: skip
-            left = [side for side, kept in zip(sides, keeps, strict=True) if kept]
-            if not left:
-                return None
-            most = max(left, key=lambda span: span.grown(TOUCH_RAD, TOUCH_RAD).area)
-        return most
+        """Return ``most``, shrunk evenly towards a place in it until no keep-out reaches into it, or None."""
+        span, (pan, tilt) = most, place
+        for part in range(ROOM_PARTS - 1, -2, -1):
+            if not any(span.enters(full) for full in self.full):
+                return span
+            (left, low), (right, high) = (
+                (pan + part / ROOM_PARTS * (to_pan - pan), tilt + part / ROOM_PARTS * (to_tilt - tilt))
+                for to_pan, to_tilt in most.corners
+            )
+            span = Span((left, right), (low, high))
+        return None
 
     def near(self, start: Span) -> tuple[Span, ...]:
         """Return every box with as much of its margin as a start leaves: nearer than it is, nothing goes."""
@@ -186,12 +164,10 @@ class KeepOuts:
         return Span.around(*start.corners, *Span.around(goal).grown(*self.beyond_rad).corners)
 
     def check_move(self, start: Span, goal: Pair, rests: bool) -> None:
-        """Pass a move from anywhere in ``start`` to a goal.
+        """Pass a move from anywhere in ``start`` to a goal. Raises KeptOut if any place that it may pass is.
 
         A head in the margin of a box may go where that is not nearer. One in a box itself may leave it the
         shortest way along one axis, from rest.
-
-        Raises KeptOut if the goal, or any place that the head may pass, is kept out.
         """
         self.check_goal(goal)
         inside = self.holding(start)
@@ -208,10 +184,7 @@ class KeepOuts:
                 )
 
     def refuse_unless_free(self, start: Span, goal: Pair, rests: bool) -> None:
-        """Check a move as `check_move` does, and search for the nearest free goal where it is refused.
-
-        Raises KeptOut: with the nearest free goal in its message.
-        """
+        """Pass what `check_move` passes. Raises KeptOut with the nearest free goal in its message."""
         try:
             self.check_move(start, goal, rests)
         except KeptOut as refused:
@@ -245,7 +218,6 @@ class KeepOuts:
         return next((one for one in by_distance if self._allows(start, one, rests)), None)
 
     def _allows(self, start: Span, goal: Pair, rests: bool) -> bool:
-        """Whether `check_move` passes a move."""
         try:
             self.check_move(start, goal, rests)
         except KeptOut:
@@ -253,9 +225,9 @@ class KeepOuts:
         return True
 
     def way_out(self, place: Pair) -> Pair | None:
-        """Return where the shortest way along one axis leaves the boxes that hold the head; None if none.
+        """Return where the shortest way along one axis leaves the boxes that hold the head.
 
-        It passes no other keep-out and ends within the joint limits.
+        It passes no other keep-out and ends within the joint limits; None if there is none.
         """
         names = {box.name for box in self.holding(Span.around(place))}
         found = []
@@ -294,11 +266,8 @@ class KeepOuts:
         out = end[axis] - at[axis]
         along = (goal[axis] - end[axis]) * math.copysign(1.0, out) >= -ASIDE_RAD
         rest = Span.around((goal[0], at[1]) if axis == 0 else (at[0], goal[1]), end)
-        if (
-            not along
-            or abs(goal[1 - axis] - at[1 - axis]) > ASIDE_RAD
-            or any(rest.enters(full) for full in self.full)
-        ):
+        aside = abs(goal[1 - axis] - at[1 - axis]) > ASIDE_RAD
+        if not along or aside or any(rest.enters(full) for full in self.full):
             raise KeptOut(
                 box.name, f"{inside}; the one move that is taken from there is out, to {_text(end)}"
             )

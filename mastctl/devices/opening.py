@@ -24,8 +24,7 @@ from drivers.open_hardware import open_one_camera as open_one_camera
 from drivers.serial_line import stable_name
 from mastctl.control.machine import latched_sentence
 from mastctl.devices.devices import HEAD, Devices
-from mastctl.devices.judge import KeepOutJudge
-from mastctl.devices.limits import Limits, SunDirection
+from mastctl.devices.judge import KeepOutJudge, Limits, SunDirection
 from mastctl.errors import Stopped
 from mastctl.safety.latch import Estopped, latched_at
 from mastctl.safety.state_folder import StateFolder, other_head_folders, take_head
@@ -37,8 +36,8 @@ STILL = "this program moves no head"
 class Bounds:
     """What bounds the moves of a head that is opened beside a daemon.
 
-    The sun is judged by the cameras of the mast file ``stored``. ``state`` is the state folder of the head's
-    daemon: a stop that is latched there holds too.
+    The sun is judged by the cameras of the mast file ``stored``. A stop that is latched in ``state``, the
+    state folder of the head's daemon, holds too.
     """
 
     limits: Limits
@@ -73,13 +72,8 @@ def devices_beside(
 ) -> Iterator[tuple[Devices, Mapping[str, Camera]]]:
     """Open a rig for a program beside the daemon; leaving stops and closes it.
 
-    ``moves``: whether the head is to be moved; if not, no move is let out; ``own_cameras``: whether the
-    caller takes images itself; `Devices` has no cameras then.
-
-    Yields
-    ------
-    Devices, Mapping of str to Camera
-        The head's moves pass the first; the cameras are in both, or in the second alone.
+    ``moves``: whether the head is to be moved; if not, no move is let out. Yields the devices, whose moves
+    are judged, and the cameras; with ``own_cameras`` the caller alone takes images.
 
     Raises Estopped if the head is to be moved and its emergency stop is latched (nothing was opened);
     StateInUse if another program drives the head; DriverError: as
@@ -137,19 +131,13 @@ class GuardedHead(PanTilt):
 
     @property
     def info(self) -> HeadInfo:
-        """As the driver."""
         return self._head.info
 
     def read(self) -> Reading:
-        """As the driver."""
         return self._head.read()
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
-        """Start the head towards a goal.
-
-        Raises OutsideLimits, KeptOut if goal or speed may not be commanded, or the head might pass a
-        keep-out, and nothing was sent; Stopped if this program moves no head; DriverError: from the driver.
-        """
+        """Start the head towards a goal. Raises OutsideLimits, KeptOut, Stopped; nothing was sent then."""
         goal = pan_rad, tilt_rad
         self.judge.limits.check(*goal)
         speed = self.judge.limits.speed(speed_rad_per_s)
@@ -180,7 +168,6 @@ class GuardedHead(PanTilt):
         self._head.stop()
 
     def close(self) -> None:
-        """As the driver."""
         self._head.close()
 
     def _judged(self, goal: tuple[float, float], speed_rad_per_s: float) -> None:

@@ -5,6 +5,10 @@ the status shows, while the other devices go on. A result that came too late is 
 thread that hangs inside a driver cannot be ended from outside: it is left alone (it is a daemon
 thread), calls to it fail at once, and it serves again when the driver returns.
 
+The stops of a head go out whatever hangs, and no move goes out before all of them are back: a driver that
+hangs may carry out an old stop much later. A move that was sent meanwhile would end half-way without a
+reason; a stop that comes back late is a fault.
+
 Deadlines and pacing run on a clock that goes on while a thread waits, whatever clock stamps the data.
 """
 
@@ -12,7 +16,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import CancelledError, Future
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -20,7 +24,7 @@ from typing import Any, Generic, TypeVar
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, LineLost, NoReply
 from mastctl.control.machine import StandingFault
-from mastctl.errors import MastctlError, one_line
+from mastctl.errors import MastctlError, Stopped, one_line
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -28,18 +32,7 @@ Check = Callable[[], None]
 
 LONGEST_MESSAGE, LONGEST_CODE = 400, 60  # of what a driver says went wrong
 CHECKED_S = 0.02  # how late a stop is noticed by a caller that waits
-
-
-@dataclass(frozen=True)
-class CallFault:
-    """How the fault of a failed call ends: a phrase that follows "until".
-
-    ``late_is_fault``: an answer that came too late is a fault itself, because the call moves something; any
-    other answer, however late, shows that the device works again.
-    """
-
-    until: str
-    late_is_fault: bool = False
+AFTER_ERROR_S = 0.2  # before the device is tried again between calls
 
 
 @dataclass(eq=False)
@@ -54,25 +47,17 @@ class ThreadCall(Generic[T]):
     submitted_s: float
     future: Future[T]
     given_up: bool = False
-
-
-@dataclass(frozen=True)
-class _CallNow:
-    """The call under way."""
-
-    what: str
-    first: bool
-    began_s: float
-    until_s: float
+    began_s: float = 0.0
 
 
 class DeviceThread:
     """The thread that alone talks to one device.
 
     ``between``: called in the thread whenever no call waits, as the call ``between_name`` with the deadline
-    ``between_timeout_s``; returns the seconds until it wants to run again, None for never; ``faults``: how
-    the faults of its calls end, by their names; ``clock``: what deadlines and pacing run on; the machine's
-    own by default.
+    ``between_timeout_s``; returns the seconds until it wants to run again, None for never. ``faults``: until
+    when the faults of its calls last, by their names. ``moves``: the call that moves something: an answer of
+    it that came too late is a fault itself; any other, however late, shows that the device works again.
+    ``clock``: what deadlines and pacing run on; the machine's own by default.
     """
 
     def __init__(
@@ -82,8 +67,8 @@ class DeviceThread:
         between: Callable[[], float | None] | None = None,
         between_name: str = "read",
         between_timeout_s: float = 1.0,
-        between_after_error_s: float = 0.2,
-        faults: Mapping[str, CallFault] | None = None,
+        faults: Mapping[str, str] | None = None,
+        moves: str = "",
         clock: Clock | None = None,
     ) -> None:
         self._device = device
@@ -91,12 +76,12 @@ class DeviceThread:
         self._between = between
         self._between_name = between_name
         self._between_timeout_s = between_timeout_s
-        self._between_after_error_s = between_after_error_s
-        self._kinds = dict(faults or {})
+        self._until = dict(faults or {})
+        self._moves = moves
         self._wake = self._clock.signal()
         self._jobs: deque[ThreadCall[Any]] = deque()
         self._closing = False
-        self._now: _CallNow | None = None
+        self._now: ThreadCall[Any] | None = None  # the call under way
         self._errors: Counter[tuple[str, str]] = Counter()
         self._faults: Mapping[str, StandingFault] = {}  # replaced, never edited: read without a lock
         self._thread = self._clock.thread(self._serve, f"device {device}")
@@ -112,19 +97,11 @@ class DeviceThread:
         anyway: bool = False,
         noted: bool = True,
     ) -> ThreadCall[T]:
-        """Queue a call and return at once.
+        """Queue a call and return at once; it may take ``timeout_s`` seconds in the thread.
 
-        Parameters
-        ----------
-        timeout_s
-            How long it may take in the thread, seconds.
-        first
-            Before everything that waits, whatever the device does meanwhile; closing lets it go out too. That
-            it hangs is its caller's to report.
-        anyway
-            Also behind a call that is overdue.
-        noted
-            Whether its errors become faults; otherwise they are its caller's to report.
+        ``first``: before everything that waits, whatever the device does meanwhile; closing lets it go out
+        too. That it hangs is its caller's to report. ``anyway``: also behind a call that is overdue.
+        ``noted``: whether its errors become faults; otherwise they are its caller's to report.
 
         Raises NoReply: at once, if the device is already overdue with an earlier call, or closed.
         """
@@ -240,16 +217,15 @@ class DeviceThread:
             device=self._device,
         )
 
-    def _overdue(self, now: _CallNow | None) -> str:
-        """Return a sentence on how late the call under way is; empty when it is not."""
+    def _overdue(self, now: ThreadCall[Any] | None) -> str:
+        """How late the call under way is; empty when it is not."""
         now_s = self._clock.now_s()
-        if now is None or now_s < now.until_s:
+        if now is None or now_s < now.began_s + now.timeout_s:
             return ""
         return f"does not answer: {now.what} has been under way for {now_s - now.began_s:.1f} s"
 
     def _fault(self, what: str, code: str, message: str, since_s: float) -> StandingFault:
-        kind = self._kinds.get(what)
-        until = f"{what} goes well again" if kind is None else kind.until
+        until = self._until.get(what, f"{what} goes well again")
         return StandingFault(
             self._device, code, message, since_s, "the line is back" if code == LineLost.code else until
         )
@@ -285,9 +261,7 @@ class DeviceThread:
                 if error is None and pause_s is None:
                     self._between = None
                     continue
-                next_between_s = self._clock.now_s() + (
-                    float(pause_s) if error is None else self._between_after_error_s
-                )
+                next_between_s = self._clock.now_s() + (float(pause_s) if error is None else AFTER_ERROR_S)
 
     def _answer(self, call: ThreadCall[Any]) -> None:
         """Make a call whose result a caller waits for."""
@@ -301,9 +275,9 @@ class DeviceThread:
 
     def _run(self, call: ThreadCall[Any]) -> tuple[Any, Exception | None]:
         """Make one call; whatever happens comes back as a result or a typed error."""
-        began_s = self._clock.now_s()
+        began_s = call.began_s = self._clock.now_s()
         with self._wake:
-            self._now = _CallNow(call.what, call.first, began_s, began_s + call.timeout_s)
+            self._now = call
         result: Any = None
         error: Exception | None = None
         try:
@@ -328,8 +302,7 @@ class DeviceThread:
             ended = "ended only now" if error is None else f"failed only now: {error}"
             late = NoReply(f"a {what} requested {late_s:.1f} s ago {ended}", device=self._device)
             log.warning("%s", late)
-            kind = self._kinds.get(what)
-            if error is None and kind is not None and kind.late_is_fault:
+            if error is None and what == self._moves:
                 error = late
         if isinstance(error, MastctlError):
             return
@@ -362,3 +335,247 @@ def _named(fault: DriverError, message: str, device: str) -> DriverError:
         named = DriverError(message, device=device)
         named.code = one_line(fault.code, LONGEST_CODE) or DriverError.code
         return named
+
+
+PATIENCE_S = 0.05  # how long a stop waits for the head's own thread before it goes out beside it
+AT_ONCE_S = 0.002  # the same for a driver that is at its best beside a call under way
+LATEST_SHARE = 1 / 8  # of the time that a head hangs already: a new stop waits no longer for its own thread
+MAY_MOVE = "the head may still move"
+UNTIL = "a stop is confirmed, or a later move is taken and the head then rests"
+UNTIL_LINE = "the line is back and the head rests, or a stop is confirmed"
+
+
+@dataclass(frozen=True)
+class _Inside:
+    """A stop inside the driver: when it was requested, and when it went in."""
+
+    requested_s: float
+    began_s: float
+
+
+class StopRequests:
+    """Sends the stops of one head and knows which of them are still on their way; safe from any thread.
+
+    A stop goes before everything that waits in the head's own thread. If that hangs in an earlier call, the
+    stop also goes out beside it, from a thread of its own: a driver that is not made for two threads may then
+    answer badly, but a stop that arrives is worth more than an answer. The one in the queue follows when the
+    hanging call is back, since that may have been a move.
+
+    ``thread``, ``device``, ``stop``: the head's own thread, its name, and the driver's stop; ``clock``: what
+    deadlines run on; ``patience_s``: how long a stop waits for the head's own thread, seconds.
+    """
+
+    def __init__(
+        self,
+        thread: DeviceThread,
+        device: str,
+        stop: Callable[[], None],
+        clock: Clock,
+        patience_s: float,
+    ) -> None:
+        self._patience_s = patience_s
+        self._clock = clock
+        self._thread = thread
+        self._device = device
+        self._stop = stop
+        self._changed = self._clock.signal()
+        self._count = 0
+        self._queued_s: float | None = None  # when the stop was requested that waits in the head's thread
+        self._inside: list[_Inside] = []
+        self._good_s = float("-inf")  # when a stop came back last that went well
+        self._failed: tuple[_Inside, Exception] | None = None
+        self._fault: StandingFault | None = None
+        self._late_s = float("-inf")  # when a stop came back last that came too late
+        self._overdue_s = float("inf")
+
+    def ticket(self) -> int:
+        """Return what a move hands to `check` later. Raises Stopped if a stop is overdue."""
+        with self._changed:
+            overdue = self._overdue(self._clock.now_s())
+            if overdue:
+                raise Stopped(overdue)
+            return self._count
+
+    def check(self, ticket: int) -> None:
+        """Pass a move that may go out now, in the head's own thread. Raises Stopped."""
+        with self._changed:
+            if ticket != self._count:
+                raise Stopped("a stop came before the move was sent")
+            if self._inside:
+                raise Stopped(self._message(self._inside[0].requested_s, self._clock.now_s()))
+
+    def send(self, timeout_s: float) -> None:
+        """Stop the head and return when that is confirmed, by this stop or by another on its way.
+
+        Raises NoReply if no stop was confirmed within ``timeout_s`` seconds; the head may still move;
+        DriverError, MastctlError if the driver refused it.
+        """
+        with self._clock.at_work():  # a simulation's second does not pass before the stop is queued
+            self._confirmed(timeout_s)
+
+    def _confirmed(self, timeout_s: float) -> None:
+        requested_s = self._clock.now_s()
+        try:
+            self._send(requested_s, timeout_s)
+        except (DriverError, MastctlError) as error:
+            message = str(error) if MAY_MOVE in str(error) else f"{error}; {MAY_MOVE}"
+            with self._changed:
+                since_s = requested_s if self._fault is None else self._fault.since_s
+                only_line = error.code == LineLost.code and (
+                    self._fault is None or self._fault.until == UNTIL_LINE
+                )  # a lost line takes nothing back of what another stop has left
+                until = UNTIL_LINE if only_line else UNTIL
+                self._fault = StandingFault(self._device, error.code, message, since_s, until)
+            raise
+        with self._changed:
+            if self._late_s < requested_s:
+                self._fault = None
+
+    def returned(self, timeout_s: float) -> bool:
+        """Return whether no stop is queued or inside the driver; wait ``timeout_s`` seconds for that.
+
+        A stop that was confirmed beside the head's own thread still has one in that thread's queue.
+        """
+        deadline_s = self._clock.now_s() + timeout_s
+        with self._changed:
+            while self._queued_s is not None or self._inside:
+                left_s = deadline_s - self._clock.now_s()
+                if left_s <= 0.0:
+                    return False
+                self._changed.wait(left_s)
+        return True
+
+    def proved(self, ticket: int) -> None:
+        """Take back what earlier stops left: the move of a later ticket was taken, and the head rests."""
+        with self._changed:
+            if ticket == self._count:
+                self._fault = None
+
+    def rests(self) -> None:
+        """Take back a stop that a lost line kept from the head: the head was read, and rests."""
+        fault = self._fault
+        if fault is not None and fault.until == UNTIL_LINE:
+            with self._changed:
+                if self._fault is fault:
+                    self._fault = None
+
+    def faults(self) -> tuple[StandingFault, ...]:
+        """Return what is wrong with the stops at this moment; takes no lock."""
+        now_s = self._clock.now_s()
+        fault, queued_s = self._fault, self._queued_s
+        overdue = self._overdue(now_s)
+        if overdue:
+            since_s = min([one.requested_s for one in tuple(self._inside)] + [queued_s or now_s])
+            message, until = f"{self._device}: {overdue}; {MAY_MOVE}", f"it is back, and then {UNTIL}"
+            return (StandingFault(self._device, NoReply.code, message, since_s, until),)
+        return () if fault is None else (fault,)
+
+    def _send(self, requested_s: float, timeout_s: float) -> None:
+        deadline_s = requested_s + timeout_s
+        beside, alone = False, ""
+        with self._changed:
+            self._count += 1
+            self._overdue_s = timeout_s
+            if self._queued_s is None:
+                self._thread.submit("stop", self._in_turn, timeout_s, first=True, noted=False)
+                self._queued_s = requested_s
+            while self._good_s < requested_s:
+                now_s = self._clock.now_s()
+                failed = self._failed is not None and self._failed[0].began_s >= requested_s
+                if failed and self._failed is not None and (self._queued_s is None or now_s >= deadline_s):
+                    raise self._failed[1]
+                if now_s >= deadline_s:
+                    message = f"stop did not end within its deadline{alone}; {MAY_MOVE}"
+                    raise NoReply(message, device=self._device)
+                again_s = deadline_s
+                if self._queued_s is not None and not beside:
+                    began_s = [one.began_s for one in self._inside]
+                    at_s = max(requested_s + self._patience_s, next_try_s(began_s, timeout_s))
+                    beside = now_s >= at_s
+                    if beside:
+                        alone = self._go_beside(requested_s, timeout_s)
+                        continue
+                    again_s = min(deadline_s, at_s)
+                self._changed.wait(again_s - now_s)
+
+    def _go_beside(self, requested_s: float, timeout_s: float) -> str:
+        """Send a stop from a thread of its own; return why that cannot be done. The lock is kept."""
+        inside = _Inside(requested_s, self._clock.now_s())
+        thread = self._clock.thread(lambda: self._beside(inside, timeout_s), "stop beside")
+        self._inside.append(inside)
+        try:
+            thread.start()
+        except RuntimeError as error:  # no more threads: the one in the queue is what is left
+            self._inside.remove(inside)
+            return f", and none could be sent beside the call that hangs ({error})"
+        return ""
+
+    def _beside(self, inside: _Inside, timeout_s: float) -> None:
+        try:
+            self._into_driver(inside, timeout_s)
+        except (DriverError, MastctlError) as error:
+            log.warning("a stop beside a hanging call failed: %s", error)
+
+    def _in_turn(self) -> None:
+        """The stop in the head's own thread."""
+        with self._changed:
+            now_s = self._clock.now_s()
+            inside = _Inside(now_s if self._queued_s is None else self._queued_s, now_s)
+            self._queued_s = None
+            self._inside.append(inside)
+        self._into_driver(inside, self._overdue_s)
+
+    def _into_driver(self, inside: _Inside, timeout_s: float) -> None:
+        """Make one stop, and wake those that wait for one."""
+        error: Exception | None = None
+        try:
+            self._stop()
+        except BaseException as anything:  # a driver from outside may raise what it likes
+            error = self._thread.typed("stop", anything)
+        ended_s = self._clock.now_s()
+        message = f"{self._device}: a stop requested {ended_s - inside.requested_s:.1f} s ago "
+        message += "ended only now" if error is None else f"failed only now: {error}"
+        with self._changed:
+            self._inside.remove(inside)
+            if error is None:
+                self._good_s = ended_s
+            else:
+                self._failed = inside, error
+            given_up = self._fault is not None and ended_s > inside.requested_s + timeout_s
+            late = given_up or ended_s > inside.began_s + timeout_s
+            if late:
+                self._late_s = ended_s
+                self._fault = StandingFault(self._device, NoReply.code, message, inside.requested_s, UNTIL)
+            self._changed.notify_all()
+        if late:
+            log.warning("%s", message)
+        if error is not None:
+            raise error
+
+    def _overdue(self, now_s: float) -> str:
+        """Say which stop has not come back in time; empty if none."""
+        good_s = self._good_s  # requests before that were answered, by another stop
+        waiting_s = [
+            one.requested_s
+            for one in tuple(self._inside)
+            if now_s >= (one.began_s if one.requested_s <= good_s else one.requested_s) + self._overdue_s
+        ]
+        return self._message(min(waiting_s), now_s) if waiting_s else ""
+
+    @staticmethod
+    def _message(requested_s: float, now_s: float) -> str:
+        overdue = f"a stop requested {now_s - requested_s:.1f} s ago has not come back from the driver yet"
+        return f"{overdue}; no move goes out before it has"
+
+
+def next_try_s(began_s: Sequence[float], timeout_s: float) -> float:
+    """Return from when on one more stop may go into a driver in which others hang.
+
+    The newest one must have hung for its deadline, or for an eighth of the time that the oldest hangs: so the
+    number of threads grows with the logarithm of that time, and a stop is never long without its own try.
+    ``began_s`` is when those inside went in, in any order, ``timeout_s`` the deadline of a stop.
+    """
+    if not began_s:
+        return float("-inf")
+    newest_s = max(began_s)
+    return newest_s + max(timeout_s, LATEST_SHARE * (newest_s - min(began_s)))

@@ -34,8 +34,8 @@ from calib.matching.track import Track, start_track
 from drivers.clock import Clock
 from mastctl.answers import CameraPixel, Step
 from mastctl.devices.joint_history import HeadReading
+from mastctl.devices.judge import Limits
 from mastctl.devices.keep_out import KeptOut, Pair
-from mastctl.devices.limits import Limits
 from mastctl.errors import MastctlError
 from mastctl.motion.measurement import CameraView, DevicesLike, available, rounded
 from mastctl.motion.requests import PixelTarget

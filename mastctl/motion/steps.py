@@ -21,8 +21,8 @@ from drivers.errors import DriverError
 from drivers.interfaces import AxisReport
 from mastctl.answers import Step
 from mastctl.devices.joint_history import HeadReading, RestWatch
+from mastctl.devices.judge import Limits
 from mastctl.devices.keep_out import KeptOut, Pair
-from mastctl.devices.limits import Limits
 from mastctl.errors import NotNow
 from mastctl.motion.measurement import (
     CameraView,

@@ -25,7 +25,7 @@ from mastctl.answers import Handover, PoseTold, TrackStands, TrackState
 from mastctl.as_json import as_json
 from mastctl.control.machine import StateMachine
 from mastctl.control.operations import Operation, OperationRunner
-from mastctl.devices.limits import Limits
+from mastctl.devices.judge import Limits
 from mastctl.errors import BadRequest, MastctlError, NotNow
 from mastctl.motion.measurement import DevicesLike
 from mastctl.motion.requests import TrackRequest

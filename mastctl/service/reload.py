@@ -16,7 +16,7 @@ from calib.files.yaml_text import parse_mapping
 from drivers.errors import BadOptions
 from mastctl.answers import ConfigChange, ReloadResult
 from mastctl.config import Config, check_cameras, load_config, parse_config
-from mastctl.devices.limits import OutsideLimits
+from mastctl.devices.judge import OutsideLimits
 from mastctl.errors import BadRequest, NotNow
 from mastctl.service.masts import MastInUse, read_next
 from mastctl.service.service import Service

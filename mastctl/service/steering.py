@@ -14,7 +14,7 @@ from mastctl.answers import Preview
 from mastctl.control.operations import Operation, OperationRunner
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import check_known
-from mastctl.devices.limits import Limits
+from mastctl.devices.judge import Limits
 from mastctl.errors import NotNow
 from mastctl.motion.loop import PointingLoop
 from mastctl.motion.requests import (

@@ -20,7 +20,7 @@ from drivers.clock import Clock
 from drivers.errors import DriverError, NoReply
 from drivers.interfaces import Camera, Frame, Reading
 from mastctl.devices.devices import Devices
-from mastctl.devices.limits import Limits
+from mastctl.devices.judge import Limits
 from mastctl.errors import MastctlError, Stopped
 from mastctl.setup.sync_fit import REACH_S, OffsetFit, fit_offset
 from mastctl.setup.sync_motion import CannotTell, JointMotion, Patches, choose_patches

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_vali
 from calib.geometry.rigid import Rigid, rotation_of
 from mastctl.control.lease import LONGEST_S, SHORTEST_S, USUAL_S
 from mastctl.control.publisher import TOPICS, Topic
-from mastctl.devices.limits import LEAST_CONE_RAD, WIDEST_CONE_RAD, SunDirection, direction_of
+from mastctl.devices.judge import LEAST_CONE_RAD, WIDEST_CONE_RAD, SunDirection, direction_of
 from mastctl.motion.requests import LARGEST_M, LARGEST_PX, Angle, Metres, Name, Place, StrictBody
 from mastctl.motion.track import RoverPose
 from mastctl.safety.latch import LONGEST

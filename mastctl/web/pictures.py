@@ -49,7 +49,7 @@ MOST_THREADS = 64
 class LiveCameras(Protocol):
     """The cameras, and the frames that are kept for viewers."""
 
-    def glance(
+    def watched_frame(
         self, camera: str, exposed_after_s: float, max_age_s: float, timeout_s: float
     ) -> StampedFrame: ...
     def hold(self, frame: StampedFrame, by: str, kept: int) -> None: ...
@@ -187,7 +187,7 @@ class CameraFeeds:
         if before is not None and not self._stands:
             every = any(one.every for one in self._of(camera))
             after_s = before.frame.exposure_began_s + (NEXT_S if every else APART_S)
-        frame = self._cameras.glance(camera, after_s, STANDS_S if self._stands else NEW_S, TIMEOUT_S)
+        frame = self._cameras.watched_frame(camera, after_s, STANDS_S if self._stands else NEW_S, TIMEOUT_S)
         if before is not None and before.frame is frame:
             return before
         return Picture(frame, frame.jpeg or encoded(frame.image, "jpeg", JPEG_QUALITY))

@@ -24,7 +24,7 @@ from mastctl.devices import cameras, joint_history
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import KEPT_FRAMES, StampedFrame
 from mastctl.devices.joint_history import JointHistory
-from mastctl.devices.limits import OutsideLimits
+from mastctl.devices.judge import OutsideLimits
 from mastctl.errors import MastctlError, NotKnown, Stopped
 
 ANGLE_TOLERANCE_RAD = 1e-12

@@ -11,7 +11,7 @@ from hil_tests.mastctl.devices.turned import Hang, Turned
 from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from mastctl.control.machine import StateMachine
 from mastctl.devices.devices import HEAD, Devices
-from mastctl.devices.limits import Limits
+from mastctl.devices.judge import Limits
 
 
 @pytest.fixture

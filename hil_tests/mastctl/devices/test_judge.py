@@ -15,9 +15,8 @@ from drivers.interfaces import AxisMotion, HeadInfo, Reading
 from hil_tests.mastctl.service_fakes import FakeHardware, FakeHead, rig
 from hil_tests.waiting import present
 from mastctl.devices.devices import HEAD, Devices
-from mastctl.devices.judge import TRAVEL_S, KeepOutJudge
+from mastctl.devices.judge import TRAVEL_S, KeepOutJudge, Limits, SunDirection, direction_of
 from mastctl.devices.keep_out import Box, KeptOut, Pair
-from mastctl.devices.limits import Limits, SunDirection, direction_of
 
 DECK = Box("deck", (-1.0, 1.0), (-1.2, -0.8))
 LIMITS = Limits((-2.5, 2.5), (-1.2, 0.6), 0.5, margin_rad=0.02, keep_out=(DECK,))

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from mastctl.devices.limits import Limits, OutsideLimits
+from mastctl.devices.judge import Limits, OutsideLimits
 
 LIMITS = Limits((-2.6, 2.6), (-1.2, 1.57), 1.0)
 
@@ -28,7 +28,7 @@ def test_angles_up_to_the_bounds_pass(pan: float, tilt: float) -> None:
 def test_the_next_number_beyond_a_bound_is_refused_and_told_apart(pan: float, tilt: float, what: str) -> None:
     with pytest.raises(OutsideLimits) as refused:
         LIMITS.check(pan, tilt)
-    assert refused.value.what == what
+    assert refused.value.detail["what"] == what
     assert refused.value.code == "outside_limits"
     value, bound = str(refused.value).split(" rad is beyond the soft limit ")
     assert value.removeprefix(f"{what} ") != bound.removesuffix(" rad")

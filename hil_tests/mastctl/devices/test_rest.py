@@ -13,7 +13,7 @@ from hil_tests.mastctl.devices.turned import Turned
 from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from mastctl.devices.devices import Devices
 from mastctl.devices.joint_history import DITHER_RAD, JointHistory, RestWatch
-from mastctl.devices.limits import Limits
+from mastctl.devices.judge import Limits
 
 XM430_RAD = 2 * math.pi / 4096
 """A count of a 12-bit servo."""

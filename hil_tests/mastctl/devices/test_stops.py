@@ -17,7 +17,7 @@ from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from hil_tests.waiting import NET_S, until
 from mastctl.devices import devices as devices_module
 from mastctl.devices.devices import Devices
-from mastctl.devices.stops import next_try_s
+from mastctl.devices.thread import next_try_s
 from mastctl.errors import MastctlError, Stopped
 
 DEADLINE_S = 1.0

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Mast, Rig, RigCamera
+from mastctl.devices.judge import ROWS, SunDirection, direction_of, sun_boxes
 from mastctl.devices.keep_out import TOUCH_RAD
-from mastctl.devices.limits import ROWS, SunDirection, direction_of, sun_boxes
 
 TILTS = (-1.2, 1.2)
 

@@ -18,8 +18,7 @@ from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from mastctl.devices import judge
 from mastctl.devices.devices import Devices
 from mastctl.devices.joint_history import HeadReading, JointHistory
-from mastctl.devices.judge import KeepOutJudge
-from mastctl.devices.limits import Limits
+from mastctl.devices.judge import KeepOutJudge, Limits
 
 HARMONICS = ((0.006, -0.002), (0.0015, 0.001))
 BACKLASH_RAD = 0.004

@@ -9,7 +9,7 @@ from typing import Any
 from drivers.clock import Clock
 from drivers.simulation_clock import SimulationClock
 from hil_tests.waiting import until
-from mastctl.devices.limits import Limits
+from mastctl.devices.judge import Limits
 
 LIMITS = Limits((-2.0, 2.0), (-1.0, 1.0), 0.5)
 DIGEST = "0123456789abcdef" * 4

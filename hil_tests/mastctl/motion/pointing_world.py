@@ -23,8 +23,8 @@ from hil_tests.calib.matching.textured_planes import Edge, Pinhole, TexturedPlan
 from mastctl.answers import PointingResult, Step
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
+from mastctl.devices.judge import Limits
 from mastctl.devices.keep_out import Pair
-from mastctl.devices.limits import Limits
 from mastctl.errors import NotKnown
 from mastctl.motion.loop import PointingLoop
 from mastctl.motion.requests import PixelTarget, PointRequest

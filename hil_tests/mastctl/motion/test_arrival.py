@@ -15,8 +15,8 @@ from drivers.clock import ManualClock
 from drivers.interfaces import Reading
 from hil_tests.mastctl.motion.pointing_world import rig
 from mastctl.devices.joint_history import HeadReading
+from mastctl.devices.judge import Limits
 from mastctl.devices.keep_out import KeptOut
-from mastctl.devices.limits import Limits
 from mastctl.motion.requests import PointingError
 from mastctl.motion.settings import PointingSettings
 from mastctl.motion.steps import Steps

@@ -18,8 +18,8 @@ from drivers.sim.pan_tilt import SimulatedPanTilt
 from drivers.simulation_clock import SimulationClock
 from mastctl.control.operations import Operation, OperationRunner
 from mastctl.devices.devices import Devices
+from mastctl.devices.judge import Limits
 from mastctl.devices.keep_out import Box
-from mastctl.devices.limits import Limits
 from mastctl.errors import NotNow
 from mastctl.motion.jog import AHEAD_S, PATIENCE_S, TICK_S, JogBeat, Jogs
 

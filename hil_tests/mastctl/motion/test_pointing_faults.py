@@ -24,7 +24,7 @@ from hil_tests.mastctl.motion.pointing_world import SIZE_PX, World, click, rig, 
 from mastctl.answers import PointingResult, Step
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import StampedFrame
-from mastctl.devices.limits import Limits
+from mastctl.devices.judge import Limits
 from mastctl.motion.loop import PointingLoop
 from mastctl.motion.requests import PixelTarget, PointingError, PointRequest
 from mastctl.motion.settings import PointingSettings

@@ -11,7 +11,7 @@ from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, ScriptedLoop
 from hil_tests.waiting import NET_S, present, until
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
-from mastctl.devices.limits import OutsideLimits
+from mastctl.devices.judge import OutsideLimits
 from mastctl.errors import Stopped
 from mastctl.service.reload import FIXED
 

@@ -35,7 +35,9 @@ class FakeCameras:
         self.released = 0
         self.as_kept = lambda: None
 
-    def glance(self, camera: str, exposed_after_s: float, max_age_s: float, timeout_s: float) -> StampedFrame:
+    def watched_frame(
+        self, camera: str, exposed_after_s: float, max_age_s: float, timeout_s: float
+    ) -> StampedFrame:
         self.glances[camera] += 1
         self.after_s.append(exposed_after_s)
         self.given.append(frame(self.glances[camera], np.zeros((4, 4), np.uint8), b"jpeg", camera))

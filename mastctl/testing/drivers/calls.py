@@ -9,8 +9,8 @@ from typing import TypeVar
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError
 from mastctl.conform.checks import NotTried, PromiseBroken, SubjectLost
+from mastctl.devices.judge import OutsideLimits
 from mastctl.devices.keep_out import KeptOut
-from mastctl.devices.limits import OutsideLimits
 
 T = TypeVar("T")
 

@@ -25,7 +25,7 @@ from drivers.interfaces import Camera
 from mastctl.config import Config, load_config
 from mastctl.conform.checks import NotTried, PromiseBroken, SubjectLost
 from mastctl.conform.rig import Angles, box
-from mastctl.devices.limits import Limits
+from mastctl.devices.judge import Limits
 from mastctl.devices.opening import Bounds, head_beside, open_one_camera
 from mastctl.errors import MastctlError
 from mastctl.service.masts import bounds_of

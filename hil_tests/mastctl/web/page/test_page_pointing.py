@@ -28,7 +28,7 @@ def rover(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
     document = yaml.safe_load(config.read_text())
     document["simulation"]["speed"] = 3.0
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(cameras, "GLANCES_SHARE", 0.5)  # the page's pictures matter here
+        patched.setattr(cameras, "WATCHED_SHARE", 0.5)  # the page's pictures matter here
         with RunningDaemon(load_config(written(folder, document))) as daemon:
             yield daemon
 
