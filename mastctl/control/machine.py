@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from drivers.clock import Clock
-from mastctl.answers import EstopHeld, Word
+from mastctl.answers import EstopHeld, FaultTold, StandingTold, StateTold, Word
+from mastctl.as_json import as_json
 from mastctl.control.publisher import Publisher
 from mastctl.errors import MastctlError, NotNow, Unable
 
@@ -30,6 +31,16 @@ class StandingFault:
     message: str
     since_s: float
     until: str
+
+    def as_json(self, now_s: float) -> FaultTold:
+        """Return it as JSON at a moment."""
+        return {
+            "device": self.device,
+            "code": self.code,
+            "message": self.message,
+            "until": self.until,
+            "for_s": max(0.0, now_s - self.since_s),
+        }
 
     def same(self, other: StandingFault) -> bool:
         """Return whether both are one fault at two moments: its message or its time may have gone on."""
@@ -175,6 +186,23 @@ class Standing:
                 return MEANINGS["starting"]
             case _:
                 return ""
+
+    def as_json(self, now_s: float) -> StateTold:
+        """Return it as JSON at a moment, as events have it."""
+        return {**self.summary(now_s), "track": self.track, "moving": bool(self.head_moves)}
+
+    def summary(self, now_s: float) -> StandingTold:
+        """Return it as JSON at a moment, without the track and whether the head moves."""
+        return {
+            "state": self.state,
+            "reason": self.reason,
+            "state_for_s": max(0.0, now_s - self.since_s),
+            "estop": as_json(self.latched[0]) if self.latched else None,
+            "estops": as_json(self.latched),
+            "operation": self.operation,
+            "target": as_json(self.target),
+            "last_residual": as_json(self.residual),
+        }
 
 
 def _sentence(fault: StandingFault) -> str:

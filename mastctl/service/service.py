@@ -20,7 +20,7 @@ from calib.matching.handoff import MatchedHandoff
 from drivers.clock import Clock, SystemClock
 from drivers.hardware import Hardware, clock_for, head_name
 from drivers.simulation_clock import SimulationClock
-from mastctl.answers import CalibrationTold, Status, TrackTold
+from mastctl.answers import CalibrationTold, CameraTold, MeasuredJoints, Status, TrackTold
 from mastctl.as_json import as_json
 from mastctl.bench.operation import BenchOperation
 from mastctl.bench.reports import Reports
@@ -33,6 +33,7 @@ from mastctl.control.operations import Operation, OperationRunner, last_frame
 from mastctl.control.publisher import Topic
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import OPERATIONS, StampedFrame, check_known, random_run
+from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.opening import open_rig
 from mastctl.errors import MastctlError
 from mastctl.motion.jog import Jogs
@@ -47,14 +48,6 @@ from mastctl.safety.latch import Latch
 from mastctl.safety.state_folder import StateFolder, other_head_folders
 from mastctl.safety.stop_socket import StopSocket, StopThreads
 from mastctl.service.masts import MastInUse, Masts, configured, read_mast
-from mastctl.service.places import Places
-from mastctl.service.state import (
-    camera_answer,
-    event_value,
-    fault_answer,
-    joints_answer,
-    standing_answer,
-)
 from mastctl.service.steering import Steering
 from mastctl.service.stopping import SocketStops, Stopping, state_faults
 from mastctl.service_manager import ServiceManager
@@ -79,38 +72,9 @@ KEPT_PICTURES = 8  # of a camera
 class Service:
     """The parts of one daemon; safe to use from any thread.
 
-    Parameters
-    ----------
-    mast
-        The mast file that the configuration names.
-    hardware
-        The opened drivers; closed by `close`.
-    folder
-        Where state is kept, closed by `close`.
-    head
-        The head's own place, where its latch is kept, closed by `close`; the state folder by default.
-
-    Attributes
-    ----------
-    machine
-        What the daemon is doing; its publisher gets every change.
-    handoffs, health, sentinel, journals
-        The drift watch: offsets of hand-offs, the verdict of residuals, and the result of reference images;
-        the thread that reads and writes their files.
-    entry, leases, audit, strangers
-        Where each command passes, which client steers, and what is recorded of it; of strangers' elsewhere.
-    stop_threads
-        Where the web side stops: threads that nothing else can keep busy.
-    bench, reports
-        Bench calibrations, and the reports that are shown.
-    head_folder
-        The head's own place, None for one in memory.
-    manager
-        What started this process, and is informed of a reload; none by default.
-    reloading
-        Locked while the configuration is read again.
-    stop_socket
-        The Unix socket for stops alone, once `open_stop_socket` was called.
+    ``folder``, where state is kept, and the head's own folder ``head``, where its latch is kept (None for one
+    in memory), are closed by `close`, the ``hardware`` too. ``machine`` states what the daemon is doing; its
+    publisher gets every change. ``reloading`` is locked while the configuration is read again.
     """
 
     def __init__(
@@ -128,7 +92,6 @@ class Service:
         self.started_s = clock.now_s()
         self._version = version("mastctl")
         self.folder = folder
-        self.places = Places(self.folder.path)
         self.head_folder = head
         beside = other_head_folders(head_name(config.hardware), head)
         self.latch = Latch(folder, others=beside) if head is None else Latch(head, folder, beside)
@@ -271,7 +234,7 @@ class Service:
         faults = self.devices.fault_watch.now()  # first: the machine hears of them
         former, reading, track = self.masts.former, self.devices.last_reading, self.tracker.status
         return {
-            **standing_answer(self.machine.standing, now_s),
+            **self.machine.standing.summary(now_s),
             "simulated": self.hardware.kind == "simulated",
             "hardware": self.hardware.kind,
             "moving": reading is not None and reading.moving,
@@ -290,7 +253,7 @@ class Service:
             "cameras": {
                 name: camera_answer(frame, now_s) for name, frame in self.devices.newest_frames().items()
             },
-            "faults": [fault_answer(fault, now_s) for fault in faults],
+            "faults": [fault.as_json(now_s) for fault in faults],
             "mast": self.masts.in_use.as_json(),
             "former_mast": None if former is None else former.as_json(),
             "version": self._version,
@@ -304,7 +267,7 @@ class Service:
             return self.track_answer(value)
         if topic == "lease":
             return {"control": self.leases.as_json()}
-        return event_value(topic, value, self.clock.now_s())
+        return published_value(topic, value, self.clock.now_s())
 
     def mast_verdict(self) -> CalibrationTold:
         """Return whether the mast file still holds, by all three kinds of evidence."""
@@ -442,6 +405,51 @@ class Service:
         """Have a hand-off counted and recorded."""
         self.handoffs.add(handoff)
         self.recorder.add_handoff(line_of(handoff))
+
+
+def camera_answer(frame: StampedFrame | None, now_s: float) -> CameraTold:
+    """Return the facts of a camera's newest frame."""
+    if frame is None:
+        return {"frame_id": None, "sequence": None, "exposure_s": None, "age_s": None}
+    return {
+        "frame_id": frame.frame_id,
+        "sequence": frame.sequence,
+        "exposure_s": frame.exposure_s,
+        "age_s": max(0.0, now_s - frame.mid_exposure_s),
+    }
+
+
+def joints_answer(reading: HeadReading, now_s: float) -> MeasuredJoints:
+    """Return a reading of the head."""
+    return {
+        "pan_rad": reading.pan_rad,
+        "tilt_rad": reading.tilt_rad,
+        "true_pan_rad": reading.true_rad[0],
+        "true_tilt_rad": reading.true_rad[1],
+        "pan_approach": reading.approach[0],
+        "tilt_approach": reading.approach[1],
+        "measured_s": reading.time_s,
+        "age_s": max(0.0, now_s - reading.time_s),
+    }
+
+
+def published_value(topic: Topic, value: Any, now_s: float) -> Any:
+    """Return a published value as events and recordings have it, but for track and lease."""
+    match topic:
+        case "state":
+            return value.as_json(now_s)
+        case "joints":
+            return {**joints_answer(value, now_s), "moving": value.moving}
+        case "fault":
+            return [one.as_json(now_s) for one in value]
+        case "frame":
+            return as_json(value) | {"age_s": max(0.0, now_s - value.mid_exposure_s)}
+        case "operation":
+            return value.as_json()
+        case "command":  # without the key, by which others would get the answer, and a lease with it
+            return {name: one for name, one in value.items() if name != "key"}
+        case _:
+            return value
 
 
 def _attached(mast: MastInUse) -> AttachedMast:

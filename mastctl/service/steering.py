@@ -49,18 +49,11 @@ def usual_s(limits: Limits, looks: int) -> float:
 
 
 class Steering:
-    """Where the head is sent, and what it follows; safe to use from any thread.
+    """Where the head is sent, and the target that it follows; safe to use from any thread.
 
-    Parameters
-    ----------
-    masts
-        The mast file in use, which stays the same while a request is judged and begun.
-    rig
-        Its part that is configured.
-    health
-        Gets each pointing's end.
-    repeat_after_s
-        Of pointings, as `mastctl.motion.settings.PointingSettings` has it; None for its default.
+    ``masts`` keeps the mast file the same while a request is judged and begun; ``rig`` is its part that is
+    configured; ``health`` gets each pointing's end. ``repeat_after_s``: as of
+    `mastctl.motion.settings.PointingSettings`; None for its default.
     """
 
     def __init__(

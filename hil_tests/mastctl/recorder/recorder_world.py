@@ -23,7 +23,7 @@ from mastctl.recorder.entries import AttachedMast
 from mastctl.recorder.recorder import Recorder
 from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.writer import Attached
-from mastctl.service.state import event_value
+from mastctl.service.service import published_value
 
 CONFIG = Attached("config.yaml", b"schema: mastctl/config/1\n")
 
@@ -82,7 +82,7 @@ class Recording:
 
 def as_published(topic: Topic, value: Any) -> Any:
     """What is published in these tests is a record already, or what the daemon's head publishes."""
-    return value if isinstance(value, dict) else event_value(topic, value, 100.0)
+    return value if isinstance(value, dict) else published_value(topic, value, 100.0)
 
 
 def _gone(frame_id: str) -> StampedFrame:

@@ -10,7 +10,7 @@ import pytest
 from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, fake_daemon
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
-from mastctl.service.places import FILE
+from mastctl.web.keeping import PLACES_FILE as FILE
 
 Pair = tuple[RunningDaemon, FakeHardware]
 HOME = {"pan_rad": 0.0, "tilt_rad": 0.0}
