@@ -102,8 +102,7 @@ class TermGain:
     ``values`` and ``sigma`` (k,) are of its parameters beside the other terms, in the units of their names;
     ``chi2`` is by how much the weighted sum of squares is lower with it, ``chance`` that of so much were it
     nothing: of a first harmonic before the second one, of a second one beyond the first. Its sigma moves
-    pixels by ``hidden_px``, the term itself by ``moves_px``, rms over all corners. If it ``entered``, it is
-    part of the model.
+    pixels by ``hidden_px``, the term itself by ``moves_px``, rms over all corners.
     """
 
     term: ModelTerm
@@ -120,18 +119,14 @@ class TermGain:
         """The term's name for people."""
         return self.term.name
 
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        """Its numbers' names (k,)."""
-        return self.term.parameters
-
     def as_json(self) -> dict[str, Any]:
         """Return the term as JSON or YAML."""
+        names = self.term.parameters
         return {
             "name": self.name,
             "entered": self.entered,
-            "values": dict(zip(self.parameters, self.values.tolist(), strict=True)),
-            "sigma": dict(zip(self.parameters, self.sigma.tolist(), strict=True)),
+            "values": dict(zip(names, self.values.tolist(), strict=True)),
+            "sigma": dict(zip(names, self.sigma.tolist(), strict=True)),
             "chi2": self.chi2,
             "chance": self.chance,
             "moves_px": self.moves_px if self.entered else None,
@@ -141,8 +136,7 @@ class TermGain:
     @property
     def sentence(self) -> str:
         """The term for a person."""
-        size = float(np.linalg.norm(self.values))
-        spread = float(np.sqrt(np.mean(self.sigma**2)))
+        size, spread = float(np.linalg.norm(self.values)), float(np.sqrt(np.mean(self.sigma**2)))
         unit = "mm" if self.term.kind in ("offset", "bow") else "mrad"
         value = f"{self.name}: {1e3 * size:.2f} ± {1e3 * spread:.2f} {unit}"
         if not self.entered:
@@ -159,17 +153,13 @@ def choose_terms(
     total, freedom = goodness(problem, fit.state, fit.covariance)
     freedom = max(freedom, 1.0)
     scale = total / freedom
-    values = problem.values(fit.state, "joints", "mast", "bow")
-    places, numbers = dict[str, list[int]](), list[str]()
-    for name, term in terms.items():
-        places[name] = list(range(len(numbers), len(numbers) + len(term.parameters)))
-        numbers += term.parameters
+    known = problem.values(fit.state, "joints", "mast", "bow")
+    numbers = [number for term in terms.values() for number in term.parameters]
+    ends = np.cumsum([len(term.parameters) for term in terms.values()], dtype=int).tolist()
+    places = {n: list(range(e - len(t.parameters), e)) for (n, t), e in zip(terms.items(), ends, strict=True)}
     at = [problem.names.index(number) for number in numbers]
-    x, c = np.array([values[number] for number in numbers]), fit.covariance[np.ix_(at, at)]
+    x, c = np.array([known[number] for number in numbers]), fit.covariance[np.ix_(at, at)]
     motion = _motion(problem, fit.state, terms, places, at)
-
-    def is_play(group: Sequence[str]) -> bool:
-        return terms[group[0]].kind == "backlash"
 
     def tested(group: Sequence[str], beside: Collection[str]) -> TermGain:
         """The test of a group in the model of itself and some other terms."""
@@ -183,22 +173,20 @@ def choose_terms(
         # Play is a width: what comes out negative is none.
         negative = is_play(group) and value[0] <= 0.0
         likely = 1.0 if negative else chance(gain, len(mine), scale, freedom)
-        hidden, moved = (
-            float(np.sqrt(max(square, 0.0)))
-            for square in (np.sum(moves * spread) * max(scale, 1.0), value @ moves @ value)
-        )
+        squares = np.array([np.sum(moves * spread) * max(scale, 1.0), value @ moves @ value])
+        hidden, moved = np.sqrt(np.maximum(squares, 0.0)).tolist()
         sigma = np.sqrt(np.maximum(np.diag(spread), 0.0))
         return TermGain(terms[group[0]], value, sigma, gain, likely, hidden, moved)
+
+    def is_play(group: Sequence[str]) -> bool:
+        return terms[group[0]].kind == "backlash"
 
     kept = entering_together(terms.values())
     while kept:
         beside = [term for group in kept for term in group]
         tests = {group: tested(group, beside) for group in kept}
-        needless = [
-            group
-            for group, test in tests.items()
-            if test.chance > Level.THREE_SIGMAS and (test.hidden_px < HIDDEN_PX or is_play(group))
-        ]
+        doubtful = [group for group, test in tests.items() if test.chance > Level.THREE_SIGMAS]
+        needless = [group for group in doubtful if tests[group].hidden_px < HIDDEN_PX or is_play(group)]
         if not needless:
             break
         kept.remove(max(needless, key=lambda group: (tests[group].chance, -tests[group].chi2)))

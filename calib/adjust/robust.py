@@ -9,7 +9,7 @@ that they show (`calib.adjust.goodness`), and so is its covariance.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -134,12 +134,8 @@ def weighed_fields(
 def weigh(cleaned: Cleaned, *, narrows: bool = True) -> Weighed:
     """Return the fit with the sigma of each kind of measurement that is worse, or better, than stated.
 
-    ``narrows`` says whether a sigma may become smaller than stated.
-
-    Raises
-    ------
-    SurveyNotFitted
-        If the last fit did not settle.
+    ``narrows`` says whether a sigma may become smaller than stated. Raises SurveyNotFitted if the last fit
+    did not settle.
     """
     problem, fit, images = cleaned.problem, cleaned.fit, cleaned.images
     weighed = dict(cleaned.cameras)
@@ -178,12 +174,6 @@ def without_blunders(
     for huber in (HUBER, None):
         problem, fit = judged(problem.with_huber(huber), fit.state, images)
     return Cleaned(problem, fit, images, cameras)
-
-
-def judged_again(cleaned: Cleaned, problem: Adjustment, start: Estimate) -> Cleaned:
-    """Return what comes of another problem of the same images, whose sigmas are those of ``cleaned``."""
-    problem, fit = judged(problem.with_huber(None), start, cleaned.images)
-    return replace(cleaned, problem=problem, fit=fit)
 
 
 def judged(

@@ -157,14 +157,14 @@ def print_error_m(problem: Adjustment, state: Estimate) -> float:
     return float(np.sqrt((agree - 2 * len(known)) / sum(float(np.trace(matrix)) for matrix, _ in known)))
 
 
-def wrong_dots(images: Sequence[ImageTerm]) -> tuple[dict[str, np.ndarray], tuple[Outlier, ...]]:
-    """Return by image which dots (n,) disagree with the rest of it (where any do), and these by name.
+def without_wrong(images: Sequence[ImageTerm]) -> tuple[list[ImageTerm], tuple[Outlier, ...]]:
+    """Return images of which dots that disagree with the rest of theirs do not count, and these by name.
 
     Where an image's typical dot is farther off than its sigma, its limit is wider by as much. Where too many
     are beyond it, it is not the dots that are wrong.
     """
-    wrong, outliers = dict[str, np.ndarray](), list[Outlier]()
-    for image in images:
+    clean, outliers = list(images), list[Outlier]()
+    for at, image in enumerate(images):
         found = next((rest for fewest, *rest in BLUNDER_DEGREES if len(image.keep) >= fewest), None)
         if found is None:
             continue
@@ -174,16 +174,11 @@ def wrong_dots(images: Sequence[ImageTerm]) -> tuple[dict[str, np.ndarray], tupl
         limit = gross**2 * at_least_stated(statistic)
         bad = np.asarray(statistic > limit)
         if bad.any() and bad.mean() <= MANY:
-            wrong[image.name] = bad
+            clean[at] = replace(image, keep=image.keep & ~bad)
             for i in np.flatnonzero(bad):
                 name = f"image {image.name} {image.part(int(i))}"
                 outliers.append(Outlier("dot", name, float(statistic[i]), limit, float(off_px[i])))
-    return wrong, tuple(outliers)
-
-
-def without_wrong(image: ImageTerm, wrong: dict[str, np.ndarray]) -> ImageTerm:
-    """Return an image of which wrong dots do not count."""
-    return replace(image, keep=image.keep & ~wrong[image.name]) if image.name in wrong else image
+    return clean, tuple(outliers)
 
 
 def off_smooth(

@@ -23,13 +23,13 @@ from calib.adjust.model_terms import ModelTerm, candidate_terms, choose_terms, t
 from calib.adjust.result import BenchCalibration
 from calib.adjust.robust import (
     SurveyNotFitted,
-    judged_again,
+    judged,
     refuse_far,
     weigh,
     weighed_fields,
     without_blunders,
 )
-from calib.adjust.scatter import print_error_m, with_scales, without_wrong, wrong_dots
+from calib.adjust.scatter import print_error_m, with_scales, without_wrong
 from calib.adjust.solver import minimise
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
@@ -80,7 +80,8 @@ def fit_bench(
         dropped = {name: term for name, term in candidates.items() if name not in chosen}
         start = _without_terms(cleaned.fit.state, dropped)
         last = bench.problem(chosen, start).with_terms(cleaned.problem.images, ())
-        cleaned = judged_again(cleaned, last, start)
+        last, fit = judged(last.with_huber(None), start, cleaned.images)
+        cleaned = replace(cleaned, problem=last, fit=fit)
         _refuse_part(cleaned.problem)
         bench.refuse_far(cleaned.problem, cleaned.fit.state)
         # counts and the least of corners are known; what a simulated or lucky bench has less is no knowledge
@@ -130,13 +131,11 @@ class BenchProblem:
                 "pictures are expected, with pan and tilt both moved between them"
             )
         views = _views(survey, images)
-        self.wrong = {n: wrong for view in views.values() for n, wrong in view.wrong.items()}
         start = bench_start(images, views, attitudes if survey.sigma.joint_rad > 0 else 0)
         self.notes += start.notes
         shown = start.estimate.rover_from_board
         self.images = [t for t in images if t.board in shown]
-        wrong, _ = wrong_dots(checks)
-        self.checks = [t.only(~wrong[t.name]) if t.name in wrong else t for t in checks if t.board in shown]
+        self.checks = [t.only(t.keep) for t in without_wrong(checks)[0] if t.board in shown]
         self.boards = tuple(dict.fromkeys(t.board[0] for t in self.images))
         self.start, self.doubtful = self._in_rover(start.estimate), start.doubtful
 
@@ -311,7 +310,7 @@ def _without_changes(bench: BenchProblem, chosen: Mapping[str, ModelTerm]) -> tu
     nothing says which of its two states is the one to come.
     """
     problem = bench.problem(chosen, bench.start).without_unseen(bench.start)
-    problem = problem.with_terms([without_wrong(t, bench.wrong) for t in problem.images], ())
+    problem = problem.with_terms(without_wrong(problem.images)[0], ())
     fit = minimise(problem, bench.start, weak=problem.weak, gain=1e-4)
     if np.isfinite(fit.normal.cost):
         problem, _, _ = with_scales(problem, fit.state, bench.images, bench.survey.sigma.corner_px)

@@ -221,18 +221,6 @@ def body_sights(rig: Rig, cameras: Sequence[str], handoffs: Sequence[MatchedHand
 
 
 @dataclass(frozen=True, eq=False)
-class CamerasApart:
-    """The remainder between the two cameras of a pair: mean of right less left, px, covariance, sigmas.
-
-    One rigid motion cannot explain it: one camera moved by itself, or its model is off.
-    """
-
-    offset_px: FloatArray
-    covariance_px2: FloatArray
-    sigmas: float
-
-
-@dataclass(frozen=True, eq=False)
 class BodyPose:
     """A proposed correction of a body pair, and how sure it is.
 
@@ -261,7 +249,6 @@ class BodyPose:
     sigmas: float
     seen: int
     unseen: tuple[str, ...]
-    cameras_apart: CamerasApart | None
 
     @property
     def significant(self) -> bool:
@@ -436,7 +423,6 @@ def _correction(used: BodySights, fit: _BodyFit, outliers: tuple[Outlier, ...]) 
         sigmas=sigmas(probability),
         seen=int(seen.sum()),
         unseen=tuple(_sentence(direction) for direction in directions.T[~seen]),
-        cameras_apart=_cameras_apart(used, fit),
     )
 
 
@@ -449,25 +435,6 @@ def _sentence(direction: FloatArray) -> str:
         f"not determined by these hand-offs: {' with '.join(parts)}, in units of {1e3 * PRIOR_SHIFT_M:g} mm "
         f"and {1e3 * PRIOR_TURN_RAD:g} mrad; only the prior holds it"
     )
-
-
-def _cameras_apart(used: BodySights, fit: _BodyFit) -> CamerasApart | None:
-    """What is left between left and right, over hand-offs that both found."""
-    if len(used.cameras) != 2:
-        return None
-    both = used.seen.all(axis=1)
-    count = int(both.sum())
-    if count < 2:
-        return None
-    pick = np.hstack([-np.eye(2), np.eye(2)]) / count
-    offset = pick @ fit.after.residual_px[both].sum(axis=0)
-    rates = pick @ fit.after.rates[both].sum(axis=0)
-    noise = fit.scale * pick @ fit.after.covariance_px2[both].sum(axis=0) @ pick.T
-    covariance = noise - rates @ fit.covariance @ rates.T
-    # What the fit explains whole has no noise left; half a thousandth of the noise is none.
-    covariance += 5e-4 * noise
-    probability = chance(float(offset @ np.linalg.solve(covariance, offset)), 2)
-    return CamerasApart(offset, covariance, sigmas(probability))
 
 
 def corrected_rig(rig: Rig, correction: BodyPose) -> Rig:

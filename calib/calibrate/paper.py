@@ -40,17 +40,9 @@ from calib.survey.records import Survey
 def fit_paper(survey: Survey, mast_parameters: int = 6) -> Calibration:
     """Fit cameras, then the mast, as the paper does.
 
-    Parameters
-    ----------
-    survey
-        The measurements; head cameras need images of purpose ``camera`` at one joint setting each.
-    mast_parameters
-        4 for a mast that is taken as upright (the paper's Table V), 6 for the paper's, 8 for two skew axes.
-
-    Raises
-    ------
-    SurveyNotFitted
-        If the survey does not determine a camera or the mast, or no start leads near the noise.
+    Head cameras need images of purpose ``camera`` at one joint setting each. ``mast_parameters`` are 4 for a
+    mast that is taken as upright (the paper's Table V), 6 for the paper's, 8 for two skew axes. Raises
+    SurveyNotFitted if the survey does not determine a camera or the mast, or no start leads near the noise.
     """
     began = time.perf_counter()
     start = start_values(survey, mast_parameters, by_purpose=True)
@@ -118,14 +110,13 @@ def two_step_covariance(
 
 
 def _left_out(images: Sequence[ImageResiduals], start: Start) -> list[Outlier]:
-    """The images left out, with how far they are off and the limit that they failed, nan if by no test."""
-    bent = {t.name: np.nan for t in start.images if t.board in start.poses.bent}
-    limits_px, found = {**bent, **start.doubtful}, []
+    """The images left out, with how far they are off."""
+    out = start.doubtful | {t.name for t in start.images if t.board in start.poses.bent}
+    found = []
     for image in images:
-        if image.name not in limits_px:
-            continue
-        in_sigmas = image.residuals_px / image.sigma_px[:, None]
-        size = float(np.sqrt(np.mean(np.sum(image.residuals_px**2, axis=1))))
-        limit = float(np.sum((limits_px[image.name] / image.sigma_px) ** 2))
-        found.append(Outlier("image", f"image {image.name}", float(np.sum(in_sigmas**2)), limit, size))
+        if image.name in out:
+            in_sigmas = image.residuals_px / image.sigma_px[:, None]
+            size = float(np.sqrt(np.mean(np.sum(image.residuals_px**2, axis=1))))
+            square = float(np.sum(in_sigmas**2))
+            found.append(Outlier("image", f"image {image.name}", square, float("nan"), size))
     return found

@@ -35,7 +35,7 @@ from calib.adjust.robust import (
 from calib.adjust.solver import minimise
 from calib.adjust.uncertainty import station_fields
 from calib.adjust.unknowns import Estimate
-from calib.calibrate.starts.survey import Start, start_values
+from calib.calibrate.starts.survey import start_values
 from calib.geometry.significance import Level
 from calib.survey.records import Survey
 
@@ -49,18 +49,9 @@ MANY = 0.15
 def fit_joint(survey: Survey, mast_parameters: int = 6) -> Calibration:
     """Fit cameras and mast to a survey, every measurement weighted by its sigma.
 
-    Parameters
-    ----------
-    survey
-        The measurements; images without dots, and check images, take no part.
-    mast_parameters
-        4 for a mast that stands upright, 6 for the paper's, 8 for two skew axes.
-
-    Raises
-    ------
-    SurveyNotFitted
-        If the survey determines no start, the fit does not settle, or it ends far from the noise: it is never
-        reported as done.
+    Images without dots, and check images, take no part. ``mast_parameters`` are 4 for a mast that stands
+    upright, 6 for the paper's, 8 for two skew axes. Raises SurveyNotFitted if the survey determines no start,
+    the fit does not settle, or it ends far from the noise: it is never reported as done.
     """
     began = time.perf_counter()
     start = start_values(survey, mast_parameters)
@@ -68,7 +59,30 @@ def fit_joint(survey: Survey, mast_parameters: int = 6) -> Calibration:
     cleaned = without_blunders(problem, start.estimate, start.images, survey.sigma.dot_px)
     change = _what_changed(cleaned)
     _refuse_wrong_minimum(cleaned.problem, cleaned.fit.state, survey.sigma.dot_px, change)
-    return _calibration(survey, mast_parameters, start, cleaned, weigh(cleaned), change, began)
+    weighed = weigh(cleaned)
+    problem, state = weighed.problem, weighed.fit.state
+    notes, widened = list(start.notes), 1.0
+    chi_square, freedom = goodness(problem, state, weighed.fit.covariance)
+    if freedom > 0 and chdtrc(freedom, chi_square) < Level.STATED:
+        notes.append(
+            f"the residuals are {np.sqrt(chi_square / freedom):.2f} times what their sigmas allow "
+            f"(chi-square {chi_square:.0f} for {freedom:.0f}); uncertainties are scaled up by as much"
+        )
+        widened = chi_square / freedom
+    kinds, checks = ("mast", "camera"), start.checks
+    fields = weighed_fields(
+        survey, cleaned, weighed, start.images, checks, kinds, Level.STATED, notes, widened
+    )
+    of_checks = tuple(f"image {t.name} dot " for t in checks)
+    fields["outliers"] += tuple(o for o in start.wrong if o.name.startswith(of_checks))
+    return Calibration(
+        **fields,
+        **station_fields(survey, problem, state),
+        method="joint",
+        mast_parameters=mast_parameters,
+        wider=(*_left_out_for(change), *_wider(cleaned, weighed)),
+        seconds=time.perf_counter() - began,
+    )
 
 
 def _what_changed(cleaned: Cleaned) -> Finding | None:
@@ -122,41 +136,6 @@ def _refuse_wrong_minimum(
         "placement each belongs to, and the joint angles",
         scatter="they are found badly, or dot_px in survey.yaml is far too small",
         coherent="station_m or joint_rad in survey.yaml is far too small",
-    )
-
-
-def _calibration(
-    survey: Survey,
-    mast_parameters: int,
-    start: Start,
-    cleaned: Cleaned,
-    weighed: Weighed,
-    change: Finding | None,
-    began: float,
-) -> Calibration:
-    """Put together what the fit says, with the stated sigmas and with those that were found."""
-    problem, state, covariance = weighed.problem, weighed.fit.state, weighed.fit.covariance
-    notes, widened = list(start.notes), 1.0
-    chi_square, freedom = goodness(problem, state, covariance)
-    if freedom > 0 and chdtrc(freedom, chi_square) < Level.STATED:
-        notes.append(
-            f"the residuals are {np.sqrt(chi_square / freedom):.2f} times what their sigmas allow "
-            f"(chi-square {chi_square:.0f} for {freedom:.0f}); uncertainties are scaled up by as much"
-        )
-        widened = chi_square / freedom
-    kinds, checks = ("mast", "camera"), start.checks
-    fields = weighed_fields(
-        survey, cleaned, weighed, start.images, checks, kinds, Level.STATED, notes, widened
-    )
-    of_checks = tuple(f"image {t.name} dot " for t in start.checks)
-    fields["outliers"] += tuple(o for o in start.wrong if o.name.startswith(of_checks))
-    return Calibration(
-        **fields,
-        **station_fields(survey, problem, state),
-        method="joint",
-        mast_parameters=mast_parameters,
-        wider=(*_left_out_for(change), *_wider(cleaned, weighed)),
-        seconds=time.perf_counter() - began,
     )
 
 

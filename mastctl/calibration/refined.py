@@ -136,7 +136,7 @@ def pose_as_json(pose: BodyPose) -> dict[str, Any]:
 
     Its covariance is of the shift, then the turn.
     """
-    correction: dict[str, Any] = {
+    return {
         **picked(pose, "cameras", "origin_m", "chance", "chi2_before", "chi2_after", "degrees_of_freedom"),
         "shift_m": pose.step[3:].tolist(),
         "turn_rad": pose.step[:3].tolist(),
@@ -152,10 +152,3 @@ def pose_as_json(pose: BodyPose) -> dict[str, Any]:
         "directions_seen": pose.seen,
         "unseen": list(pose.unseen),
     }
-    if pose.cameras_apart is not None:
-        correction["cameras_apart"] = {
-            "right_less_left_px": pose.cameras_apart.offset_px.tolist(),
-            "covariance_px2": pose.cameras_apart.covariance_px2.tolist(),
-            "sigmas": pose.cameras_apart.sigmas,
-        }
-    return correction

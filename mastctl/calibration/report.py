@@ -221,7 +221,7 @@ def _terms(fit: BenchCalibration) -> Table:
     for term in fit.terms:
         size = float(np.linalg.norm(term.values))
         spread = float(np.sqrt(np.mean(term.sigma**2))) if len(term.sigma) else 0.0
-        length = any(name.endswith("_m") or ".bow_m" in name for name in term.parameters)
+        length = any(name.endswith("_m") or ".bow_m" in name for name in term.term.parameters)
         rows.append(
             [
                 term.name,

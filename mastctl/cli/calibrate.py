@@ -23,7 +23,7 @@ TESTS_SHOWN = 4
 REFINED = (
     "corrections.*.significant corrections.*.significance_sigmas corrections.*.shift_m "
     "corrections.*.turn_rad corrections.*.handoffs corrections.*.rms_px corrections.*.unseen "
-    "corrections.*.outliers corrections.*.cameras_apart refusals.*.message other_mast"
+    "corrections.*.outliers refusals.*.message other_mast"
 )
 """What people see of a correction."""
 SURVEY_FILES = ("survey.yaml", "station.csv", "images.csv", "dots.csv", "clicks.csv")

@@ -30,18 +30,12 @@ POINTS = 25
 
 @dataclass(frozen=True, eq=False)
 class Agreed:
-    """A fit, its images (points that took no part are not kept), how far the typical image is off, and how
-    far one that took part may be (both of a coordinate, pixels)."""
+    """A fit, its images (points that took no part are not kept), and how far the typical image is off (of a
+    coordinate, pixels)."""
 
     fit: Minimum[Estimate]
     images: tuple[ImageTerm, ...]
     typical_px: float
-    limit_px: float
-
-    @property
-    def left_out(self) -> dict[str, float]:
-        """By name of an image that took no part how far off (rms of distances, pixels) it may be."""
-        return {t.name: float(np.sqrt(2.0)) * self.limit_px for t in self.images if not t.keep.any()}
 
 
 def fit_agreeing(
@@ -82,7 +76,7 @@ def fit_agreeing(
         if not fit.settled:
             return None
         state, offs = fit.state, distances_px(problem, fit.state, images)
-    return Agreed(fit, tuple(kept), float(np.median(typical_sizes(offs))), limit_px)
+    return Agreed(fit, tuple(kept), float(np.median(typical_sizes(offs))))
 
 
 def best_agreeing(

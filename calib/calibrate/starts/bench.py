@@ -79,13 +79,9 @@ class _Tied(NamedTuple):
 def bench_start(images: Sequence[ImageTerm], views: Mapping[str, ViewPoses], attitudes: int) -> BenchStart:
     """Return where to start the fit of a bench from what each camera says by itself.
 
-    ``attitudes`` is how many of the head have angles of their own; 0 where readings are exact.
-
-    Raises
-    ------
-    BenchNotFitted
-        If the head moved too little, a board stood at two places, or a body camera sees no board that a head
-        camera sees.
+    ``attitudes`` is how many of the head have angles of their own; 0 where readings are exact. Raises
+    BenchNotFitted if the head moved too little, a board stood at two places, or a body camera sees no board
+    that a head camera sees.
     """
     on_head = {t.camera for t in images if t.attitude is not None}
     elsewhere = {t.board: set[str]() for t in images}

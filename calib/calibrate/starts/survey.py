@@ -26,7 +26,7 @@ from calib.adjust.adjustment import Adjustment
 from calib.adjust.gross import Outlier, chance_limit
 from calib.adjust.outliers import name_outliers
 from calib.adjust.robust import SurveyNotFitted, judged
-from calib.adjust.scatter import without_wrong, wrong_dots
+from calib.adjust.scatter import without_wrong
 from calib.adjust.terms import ImageTerm, StationTerm, image_terms, station_terms
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.agreeing import Agreed
@@ -136,8 +136,8 @@ class Start:
 
     ``images`` are with every dot, ``fitted`` with those that the steps were made with, ``checks`` without
     wrong ones. Cameras were fitted to ``camera_images``; ``references`` has them in the rover frame at the
-    joint setting at which they were calibrated. ``doubtful`` says by image that did not agree how far off
-    (rms of distances, pixels) it may be, ``wrong`` are dots that disagree with the rest of their image.
+    joint setting at which they were calibrated. ``doubtful`` are images that did not agree, ``wrong`` dots of
+    all images that disagree with the rest of theirs.
     """
 
     images: tuple[ImageTerm, ...]
@@ -147,7 +147,7 @@ class Start:
     camera_images: frozenset[str]
     estimate: Estimate
     references: References
-    doubtful: Mapping[str, float]
+    doubtful: frozenset[str]
     poses: StationPoses
     wrong: tuple[Outlier, ...]
     notes: tuple[str, ...]
@@ -179,9 +179,9 @@ def start_values(survey: Survey, mast_parameters: int, *, by_purpose: bool = Fal
         raise SurveyNotFitted(str(error)) from None
     notes, boards = list(poses.notes), poses.rover_from_board
     images, checks, joints = image_terms(survey, boards, notes)
-    wrong, outliers = wrong_dots([*images, *checks])
+    every, wrong = without_wrong([*images, *checks])
+    clean, checks = every[: len(images)], every[len(images) :]
     purposes = {i.name: i.purpose for i in survey.images}
-    clean = [without_wrong(t, wrong) for t in images]
     if by_purpose:
         clean = [replace(t, sigma_px=np.full(len(t.rows), survey.sigma.dot_px)) for t in clean]
     usable = [t for t in clean if t.board not in poses.bent]
@@ -209,7 +209,7 @@ def start_values(survey: Survey, mast_parameters: int, *, by_purpose: bool = Fal
             settings[name] = setting
     references = References(in_rover, settings)
     camera_images = frozenset(t.name for fit in fits for t in fit.images)
-    doubtful = {name: limit for fit in fits for name, limit in fit.left_out.items()}
+    doubtful = {t.name for fit in fits for t in fit.images if not t.keep.any()}
     # Cameras fitted to few boards are off by more, away from where these stood, than their own residuals.
     most = 3 * max((expected[name] for name in settings), default=0.0)
     mast = np.zeros(len(MAST_NAMES))
@@ -222,7 +222,7 @@ def start_values(survey: Survey, mast_parameters: int, *, by_purpose: bool = Fal
     if away:
         fits.append(fit_mast(away, boards, references, mast_parameters, expected_px=most))
         mast = fits[-1].fit.state.mast
-        doubtful |= fits[-1].left_out
+        doubtful |= {t.name for t in fits[-1].images if not t.keep.any()}
     elif settings:
         notes.append("every head image was taken at one joint setting: the mast is not calibrated")
         mast[:3] = np.mean([in_rover[name].C for name in settings], axis=0)
@@ -232,7 +232,7 @@ def start_values(survey: Survey, mast_parameters: int, *, by_purpose: bool = Fal
     return Start(
         tuple(images),
         tuple(replace(t, keep=kept[t.name]) for t in clean if t.camera in in_rover),
-        tuple(t.only(~wrong[t.name]) if t.name in wrong else t for t in checks if t.camera in in_rover),
+        tuple(t.only(t.keep) for t in checks if t.camera in in_rover),
         station_terms(survey, boards),
         camera_images,
         Estimate(
@@ -244,9 +244,9 @@ def start_values(survey: Survey, mast_parameters: int, *, by_purpose: bool = Fal
             np.zeros((len(joints) if survey.sigma.joint_rad > 0 else 0, 2)),
         ),
         references,
-        doubtful,
+        frozenset(doubtful),
         poses,
-        outliers,
+        wrong,
         tuple(notes),
     )
 

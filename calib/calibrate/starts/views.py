@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.adjust.adjustment import Adjustment
 from calib.adjust.gross import gross_limit
-from calib.adjust.scatter import without_wrong, wrong_dots
+from calib.adjust.scatter import without_wrong
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.agreeing import best_agreeing
@@ -40,13 +40,11 @@ class ViewPoses:
     """One camera by itself, with C at the origin and A along z.
 
     ``poses`` are by image name camera_from_board: the likeliest, and the other one if it is nearly as good.
-    ``wrong`` says by image name which of its points (n,) disagree with the rest of it, where any do;
     ``doubtful`` are images that no pose explains.
     """
 
     model: CameraModel
     poses: dict[str, tuple[Rigid, ...]]
-    wrong: dict[str, np.ndarray]
     doubtful: frozenset[str]
 
 
@@ -61,15 +59,9 @@ def view_poses(
     """Return a camera and where the board, which is flat, stood in each of its images.
 
     The focal length may be some 20 % off, or None where nothing is known of it. The lens is fitted to
-    ``images_for_lens`` of the images at most.
-
-    Raises
-    ------
-    ViewsTooFew
-        If no camera explains the images.
+    ``images_for_lens`` of the images at most. Raises ViewsTooFew if no camera explains the images.
     """
-    wrong, _ = wrong_dots(images)
-    clean = [t for t in (without_wrong(t, wrong) for t in images) if t.keep.sum() >= FEWEST_POINTS]
+    clean = [t for t in without_wrong(images)[0] if t.keep.sum() >= FEWEST_POINTS]
     if not clean:
         raise ViewsTooFew(f"{len(images)} images, none of which shows {FEWEST_POINTS} corners of a board")
     spread = np.linspace(0, len(clean) - 1, min(images_for_lens, len(clean))).astype(int)
@@ -93,7 +85,7 @@ def view_poses(
             off[term.name] = found_poses[0][0]
     limit = gross_limit(list(off.values()), 1.0) if off else 0.0
     doubtful = {t.name for t in images if t.name not in off or off[t.name] > limit}
-    return ViewPoses(model, poses, wrong, frozenset(doubtful))
+    return ViewPoses(model, poses, frozenset(doubtful))
 
 
 def _focal_lengths(

@@ -129,7 +129,7 @@ def test_joint_readings_count_as_measurements_where_changes_are_looked_for(
 
     monkeypatch.setattr(hypotheses, "chance", chance)
     fit = fit_bench(simulate_bench(1, BenchPlan(attitudes=10, **SERVO)))
-    terms = sum(len(t.parameters) for t in fit.terms)
+    terms = sum(len(t.term.parameters) for t in fit.terms)
     # all terms are fitted then; readings without a number of their own would be some 70 fewer
     assert freedoms[0] == pytest.approx(fit.degrees_of_freedom, abs=terms)
 

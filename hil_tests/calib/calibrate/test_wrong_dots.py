@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib.adjust.gross import Outlier
-from calib.adjust.scatter import wrong_dots
+from calib.adjust.scatter import without_wrong
 from calib.adjust.terms import image_terms
 from calib.calibrate.paper import fit_paper
 from calib.calibrate.starts.survey import station_poses
@@ -31,7 +31,8 @@ def rig() -> Rig:
 def wrong_in(survey: Survey) -> tuple[dict[str, np.ndarray], tuple[Outlier, ...]]:
     """The wrong dots of all images, check images among them."""
     images, checks, _ = image_terms(survey, station_poses(survey).rover_from_board, [])
-    return wrong_dots([*images, *checks])
+    clean, wrong = without_wrong([*images, *checks])
+    return {t.name: ~t.keep for t in clean if not t.keep.all()}, wrong
 
 
 @pytest.fixture(scope="module")
