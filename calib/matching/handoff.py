@@ -44,44 +44,27 @@ _VERDICTS: Mapping[str, RefinedVerdict] = {
 
 @dataclass(frozen=True)
 class RefineSettings:
-    """Thresholds of the refinement, with the reasons for their values.
+    """Thresholds of the refinement, with the reasons for their values."""
 
-    Attributes
-    ----------
-    sigmas, least_px, most_px
-        Half axes of the search ellipse in standard deviations, and bounds of the window's half side; below,
-        the ellipse would be smaller than what the warp can be wrong by.
-    model_px
-        One sigma of what camera models are wrong by, for comparing what cameras see. Flight cameras: 0.2 to
-        0.5.
-    click_px
-        How far the second click may lie from where the pair's pictures put the first, beyond four sigma.
-    worst_chi2
-        Of four degrees of freedom: 1 in 1000 good pairs is above 18.5.
-    """
-
-    sigmas: float = 3.0
-    least_px: float = 3.0
+    sigmas: float = 3.0  # half axes of the search ellipse in standard deviations
+    least_px: float = (
+        3.0  # of the window's half side: below, it would be smaller than what the warp is wrong by
+    )
     most_px: float = 60.0
     model_px: float = 0.4
+    """One sigma of what camera models are wrong by, for comparing what cameras see. Flight cameras: 0.2 to
+    0.5."""
     click_px: float = 2.0
-    worst_chi2: float = 18.5
+    """How far the second click may lie from where the pair's pictures put the first, beyond four sigma."""
+    worst_chi2: float = 18.5  # of four degrees of freedom: 1 in 1000 good pairs is above
 
 
 @dataclass(frozen=True, eq=False)
 class RefinedPixel:
-    """Where a destination camera sees the target, by its picture.
+    """Where a destination camera sees the target (2,), by its picture; not-a-number unless ``accepted``.
 
-    Attributes
-    ----------
-    verdict, reason
-        Only ``accepted`` is a measurement; the reason is one sentence, empty for ``accepted``.
-    pixel_px, covariance_px2
-        (2,) and (2, 2); not-a-number unless accepted.
-    off_px
-        (2,) from the geometric hand-off's pixel to the found one.
-    correlation, second
-        At the best place and at the second best.
+    Only that is a measurement; the reason is one sentence, empty for ``accepted``. ``off_px`` (2,) goes from
+    the geometric hand-off's pixel to the found one.
     """
 
     verdict: RefinedVerdict
@@ -239,33 +222,22 @@ class Landed:
 
 @dataclass(frozen=True, eq=False)
 class MatchedHandoff:
-    """A target handed from a stereo pair to other cameras and looked up in their pictures.
+    """A target handed from a stereo pair to other cameras and found in their pictures.
 
-    Attributes
-    ----------
-    time
-        ISO 8601, UTC.
-    mast_digest
-        Of the mast file that was believed.
-    joints, to_joints
-        Joint readings of the source's and of the destination's pictures.
-    clicks_px, sigma_px
-        (2, 2) the target in the pictures of the pair, left one first, and the sigma of each coordinate.
-    landed
-        By destination camera that was to see it.
-    name
-        Where it is stored, for messages; empty if nowhere.
+    ``joints`` and ``to_joints`` are the readings of the source's and of the destination's pictures,
+    ``clicks_px`` (2, 2) the target in the pictures of the pair, left one first, ``sigma_px`` that of each
+    coordinate.
     """
 
-    time: str
-    mast_digest: str
+    time: str  # ISO 8601, UTC
+    mast_digest: str  # of the mast file that was believed
     pair: tuple[str, str]
     joints: Joints
     clicks_px: FloatArray
     sigma_px: float
     to_joints: Joints
-    landed: Mapping[str, Landed]
-    name: str = ""
+    landed: Mapping[str, Landed]  # by destination camera that was to see it
+    name: str = ""  # where it is stored, for messages; empty if nowhere
 
     @property
     def found(self) -> dict[str, Landed]:
@@ -309,26 +281,17 @@ def matched_handoff(
 
 @dataclass(frozen=True, eq=False)
 class HandoffBias:
-    """The mean offset of one camera against the pair that handed over.
-
-    Attributes
-    ----------
-    handoffs, left_out
-        Accepted matches that were averaged, and those too far from the median.
-    offset_px, covariance_px2
-        (2,) found less predicted, weighted mean, and its (2, 2) covariance.
-    chance, sigmas
-        Of such a mean without any offset, and the same in sigmas.
-    """
+    """The mean offset of one camera against the pair that handed over: found less predicted (2,),
+    weighted."""
 
     source: str
     camera: str
-    handoffs: int
-    left_out: int
+    handoffs: int  # accepted matches that were averaged
+    left_out: int  # and those too far from the median
     offset_px: FloatArray
     covariance_px2: FloatArray
-    chance: float
-    sigmas: float
+    chance: float  # of such a mean without any offset
+    sigmas: float  # the same
 
     @property
     def significant(self) -> bool:

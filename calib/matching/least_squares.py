@@ -38,18 +38,11 @@ _RIGID = [0, 1, 6, 7]  # the columns of place, gain and offset
 
 @dataclass(frozen=True, eq=False)
 class LeastSquaresMatch:
-    """Where the target is, and how well the patch fits there.
+    """Where the target is (2,) in the destination image, and how well the patch fits there.
 
-    Attributes
-    ----------
-    pixel_px, covariance_px2
-        (2,) the target in the destination image, and (2, 2) of that position.
-    deformation
-        (2, 2) D: what the warp did not foresee, as a linear map of offsets from the target.
-    correlation
-        Normalized correlation of template and image, -1..1, weighted by ``counts`` and ``near_px2`` alone.
-    middle
-        The place that the patch's middle alone shows, `NARROW` as wide, the deformation kept.
+    ``deformation`` (2, 2) is D: what the warp did not foresee, as a linear map of offsets from the target.
+    ``correlation`` of template and image, -1..1, is weighted by ``counts`` and ``near_px2`` alone. ``middle``
+    is the place that the patch's middle alone shows, `NARROW` as wide, the deformation kept.
     """
 
     pixel_px: FloatArray
@@ -71,20 +64,11 @@ def match_least_squares(
 ) -> LeastSquaresMatch | None:
     """Find where the image (h, w) shows the template, from a start (2,) good to about a pixel.
 
-    None if it did not settle, left the image, or found nothing to fix a place by.
-
-    Parameters
-    ----------
-    template
-        (h, w) grey, its middle on the whole pixel ``centre_px`` (2,).
-    target_px
-        (2,) the target's place in the template's own pixel grid.
-    block_px
-        Side of the blocks of pixels: over how many grey differences may depend on each other.
-    near_px2
-        (2, 2) covariance of a Gaussian around the target by which pixels are weighted; all alike by default.
-    counts
-        (h, w) weights of the template's pixels, 0 to 1, beside that; all alike by default.
+    None if it did not settle, left the image, or found nothing to fix a place by. The middle of the template
+    (h, w) is on the whole pixel ``centre_px`` (2,), the target at ``target_px`` (2,) of its own pixel grid.
+    ``block_px`` is the side of the blocks of pixels: over how many grey differences may depend on each other.
+    Pixels are weighted by a Gaussian around the target of covariance ``near_px2`` (2, 2), and by ``counts``
+    (h, w), 0 to 1; all alike by default.
     """
     from scipy import ndimage  # slow to load, and a daemon that starts does not need it
 

@@ -56,16 +56,10 @@ FINE_STEPS = np.arange(-3.0, 3.5, 0.5)  # px around each of the best coarse plac
 
 @dataclass(frozen=True, eq=False)
 class StereoMatch:
-    """The partner of a pixel, the surface there, and whether the cameras agree.
+    """The partner of a pixel, and the surface there; nothing but ``match`` is valid unless that is ``good``.
 
-    Attributes
-    ----------
-    match
-        The partner pixel with its verdict; nothing below is valid unless it is ``good``.
-    plane, relief
-        A plane that fits what both cameras see near the pixel, and what stands off it.
-    across_px, across_sigma_px
-        Distance of the partner from the epipolar line, signed, and one sigma of the matching alone.
+    ``plane`` fits what both cameras see near the pixel, ``relief`` is what stands off it. ``across_px`` is
+    the distance of the partner from the epipolar line, signed, with one sigma of the matching alone.
     """
 
     match: PatchMatch

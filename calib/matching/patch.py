@@ -40,55 +40,33 @@ MatchVerdict = Literal["good", "flat", "ambiguous", "weak", "border"]
 
 @dataclass(frozen=True)
 class MatchSettings:
-    """Sizes and thresholds of the matching, with the reasons for their values.
-
-    Attributes
-    ----------
-    half_px, smallest_half_px, most_half_px
-        Half of the patch's side in the coarser picture, and how far it may shrink at a picture's border and
-        grow in an enlarged one. 20 (41 px) fixes a place to 0.02 px with usual texture and is still
-        nearly plane on a rock. With ``near_px`` a patch is as large as its Gaussian.
-    noise_dn
-        Grey noise of one picture, one sigma.
-    flat_sigma_px
-        A patch whose gradient cannot hold this sigma in its worst direction is flat. Edges fail here too.
-    least_correlation
-        Of what noise alone allows. Unrelated patches of 41 px reach 0.3-0.5 somewhere in a window.
-    least_lead, worst_ratio
-        A second place is ambiguous if its correlation is nearer than ``least_lead``, or if the best leaves
-        more than ``worst_ratio`` of what the second leaves unexplained: (1 - best)/(1 - second).
-    apart_px
-        Peaks nearer than this are one peak.
-    worst_sigma_px
-        A position less certain than this is no measurement.
-    roughness
-        How far the target may lie off the patch's plane, one sigma, as a part of the patch's half extent on
-        it. It matters as far as the two cameras are apart. 0 for what is known to be plane; the default
-        is what makes sigmas true on the simulated rover's ground and rocks.
-    rough_beside_relief
-        Whether ``roughness`` is added too where two cameras saw what stands off the plane.
-    near_px
-        By how much nearer pixels count more in the refinement: one sigma of a Gaussian that is round on the
-        surface and as large as a circle of this radius in the destination. 0: all of the patch alike.
-    relief
-        ``roughness`` grows by its own size for each such part of the correlation that neither noise nor the
-        warp explains: what is no plane correlates worse from elsewhere. 0: it does not grow.
-    """
+    """Sizes and thresholds of the matching, with the reasons for their values."""
 
     half_px: int = 20
-    smallest_half_px: int = 9
-    most_half_px: int = 90
-    noise_dn: float = 2.0
+    """Half of the patch's side in the coarser picture. 20 (41 px) fixes a place to 0.02 px with usual texture
+    and is still nearly plane on a rock. With ``near_px`` a patch is as large as its Gaussian."""
+    smallest_half_px: int = 9  # at a picture's border
+    most_half_px: int = 90  # in an enlarged picture
+    noise_dn: float = 2.0  # one sigma of one picture's grey noise
     flat_sigma_px: float = 0.15
+    """A patch whose gradient cannot hold this sigma in its worst direction is flat. Edges fail here too."""
     least_correlation: float = 0.7
-    least_lead: float = 0.08
-    worst_ratio: float = 0.6
-    apart_px: int = 5
-    worst_sigma_px: float = 0.5
+    """Of what noise alone allows. Unrelated patches of 41 px reach 0.3-0.5 somewhere in a window."""
+    least_lead: float = 0.08  # a second place whose correlation is nearer is ambiguous,
+    worst_ratio: float = 0.6  # as one of which (1 - best)/(1 - second) is more
+    apart_px: int = 5  # peaks nearer than this are one peak
+    worst_sigma_px: float = 0.5  # a position less certain is no measurement
     roughness: float = 0.01
-    rough_beside_relief: bool = True
+    """How far the target may lie off the patch's plane, one sigma, as a part of the patch's half extent on
+    it. It matters as far as the two cameras are apart. 0 for what is known to be plane; the default is what
+    makes sigmas true on the simulated rover's ground and rocks."""
+    rough_beside_relief: bool = True  # also where two cameras saw what stands off the plane
     near_px: float = 0.0
+    """By how much nearer pixels count more in the refinement: one sigma of a Gaussian that is round on the
+    surface and as large as a circle of this radius in the destination. 0: all of the patch alike."""
     relief: float = 0.0
+    """``roughness`` grows by its own size for each such part of the correlation that neither noise nor the
+    warp explains: what is no plane correlates worse from elsewhere. 0: it does not grow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,16 +107,9 @@ def match_patch(
 ) -> PatchMatch:
     """Find the target at ``source_px`` (2,) of one picture in another.
 
-    Parameters
-    ----------
-    plane
-        The scene around the target, in the images' common frame.
-    search_px
-        Half side of the window around the predicted place, destination pixels. Raises ValueError if it has no
-        finite size.
-    relief
-        The relief off the plane around the target, if two cameras saw it; pixels that do not belong to the
-        surface are left out.
+    ``plane`` is the scene around the target, in the images' common frame, ``search_px`` half the side of the
+    window around the predicted place, destination pixels (ValueError if that has no finite size). Pixels that
+    do not belong to the surface by the ``relief`` are left out.
     """
     if not 0.0 <= search_px < math.inf:
         raise ValueError(f"search_px is {search_px} where a finite number, 0 or more, is expected")

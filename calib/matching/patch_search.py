@@ -134,27 +134,15 @@ SEARCH_SIGMA = 0.15
 
 @dataclass(frozen=True, eq=False)
 class AgreedView:
-    """A view by the patches that agree on it.
-
-    Attributes
-    ----------
-    angles_rad, sigma_rad, parallax_rad
-        (2,) pan and tilt, one sigma, and the largest error by ranges that are not known.
-    rate_px_per_rad
-        (n, 2, 2) of the agreeing patches.
-    agreeing, expected
-        Patches that agree, and that the view should show.
-    correlation
-        Mean of the agreeing ones.
-    """
+    """A view, pan and tilt (2,), by the patches that agree on it."""
 
     angles_rad: FloatArray
     sigma_rad: FloatArray
-    parallax_rad: FloatArray
-    rate_px_per_rad: FloatArray
+    parallax_rad: FloatArray  # (2,) the largest error by ranges that are not known
+    rate_px_per_rad: FloatArray  # (n, 2, 2) of the agreeing patches
     agreeing: int
-    expected: int
-    correlation: float
+    expected: int  # patches that the view should show
+    correlation: float  # mean of the agreeing ones
 
 
 def agreed_view(

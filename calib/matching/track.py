@@ -50,37 +50,24 @@ better than elsewhere: the other camera and the prediction must confirm the best
 
 @dataclass(frozen=True)
 class TrackSettings:
-    """Thresholds of the tracking, with the reasons for their values.
+    """Thresholds of the tracking, with the reasons for their values."""
 
-    Attributes
-    ----------
-    sigmas, least_px, most_px
-        Half width of the search window in standard deviations of the prediction, and its bounds.
-    model_px
-        One sigma of what the cameras' models are wrong by between two cameras and two pairs.
-    worst_chi2
-        Of the innovation, four pixel coordinates against the prior: 1 in 1000 good matches of both cameras is
-        above 18.5.
-    renew_grown, renew_shrunk, renew_shape
-        The key picture is renewed when the target's surface is seen this much larger or smaller, or
-        foreshortened this much otherwise: seen flat, a step nearer shows much that it did not.
-    renew_below
-        Or when the correlation falls below this: what is seen now is no longer what the key picture shows.
-        One camera that sees so little of it does not find a lost target again.
-    worst_drift_m
-        One sigma of the drift from the picked place; beyond it the target is reported as lost.
-    """
-
-    sigmas: float = 3.5
+    sigmas: float = 3.5  # of the prediction, half the width of the search window, and its bounds
     least_px: float = 4.0
     most_px: float = 120.0
-    model_px: float = 0.12
+    model_px: float = 0.12  # one sigma of what the models are wrong by between two cameras and two pairs
     worst_chi2: float = 18.5
+    """Of the innovation, four pixel coordinates against the prior: 1 in 1000 good matches of both cameras is
+    above."""
     renew_grown: float = 1.8
+    """The key picture is renewed when the target's surface is seen this much larger (or smaller), or
+    foreshortened this much otherwise: seen flat, a step nearer shows much that it did not."""
     renew_shrunk: float = 0.3
     renew_shape: float = 1.5
     renew_below: float = 0.8
-    worst_drift_m: float = 0.03
+    """Or when the correlation falls below this: what is seen now is no longer what the key picture shows.
+    One camera that sees so little of it does not find a lost target again."""
+    worst_drift_m: float = 0.03  # one sigma of the drift from the picked place; beyond it the target is lost
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,21 +86,13 @@ class KeyPicture:
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A followed target. Immutable: every step gives a new one.
+    """A followed target: its place (3,) with covariance (3, 3), in the rover frame of the last motion.
 
-    Attributes
-    ----------
-    state
-        ``tracked``: the last pictures showed it. ``lost``: they did not.
-    position_m, covariance_m2
-        (3,) and (3, 3) of the place that is followed, in the rover frame of the last motion.
-    standby
-        The key that the last pictures of both cameras would have given: what is searched for where the key
-        loses the target, since the light has changed or another side shows. None after a renewal.
-    misses
-        Searches since it was last found.
-    motion_covariance
-        (6, 6) of the rover's motion since then, as `moved_track` takes it; it is part of ``covariance_m2``.
+    ``tracked``: the last pictures showed it. ``lost``: they did not. ``standby`` is the key that the last
+    pictures of both cameras would have given: what is searched for where the key loses the target, since the
+    light has changed or another side shows. None after a renewal. ``misses`` counts searches since it was
+    last found, ``motion_covariance`` (6, 6) is that of the rover's motion since then, as `moved_track` takes
+    it; it is part of ``covariance_m2``.
     """
 
     state: State
@@ -222,13 +201,9 @@ is found 2 px off the epipolar line is another thing, or the mast file is off.""
 def start_track(left: PosedImage, right: PosedImage, left_px: FloatArray, sigma_px: float = 0.2) -> Track:
     """Begin a track from a click (2,) in the left picture of a pair, of one moment, in the rover frame.
 
-    ``sigma_px`` of the click says how well the place of what was meant is known.
-
-    Raises
-    ------
-    CalibError
-        With the reason, if the target cannot be followed: sky, plain surface, an edge, repeated pattern,
-        hidden from the other camera, outside the picture.
+    ``sigma_px`` of the click says how well the place of what was meant is known. Raises CalibError with the
+    reason, if the target cannot be followed: sky, plain surface, an edge, repeated pattern, hidden from the
+    other camera, outside the picture.
     """
     pixel = np.asarray(left_px, dtype=np.float64)
     if pixel.shape != (2,) or not np.isfinite(pixel).all():

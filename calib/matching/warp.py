@@ -132,19 +132,12 @@ def patch_grid(half_px: tuple[int, int]) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """A warped patch on the destination's pixel grid.
+    """A warped patch on the destination's pixel grid: grey values (h, w), h and w odd.
 
-    Attributes
-    ----------
-    values, counts
-        float32 (h, w) grey values, h and w odd; rows and columns are the destination's. (h, w) weights of the
-        pixels, 0 to 1; None if all are alike.
-    centre_px
-        (2,) whole pixel of the destination on which the middle of the patch lies.
-    target_px
-        (2,) where the plane's geometry puts the target in the destination; within half a pixel of the centre.
-    magnification
-        Destination pixels per source pixel: above 1 the template is blurred against the destination.
+    ``centre_px`` (2,) is the destination's whole pixel on which the middle of the patch lies, ``target_px``
+    (2,), within half a pixel, where the plane's geometry puts the target. ``magnification`` is destination
+    pixels per source pixel: above 1 the template is blurred against the destination. ``counts`` (h, w) are
+    weights of the pixels, 0 to 1; None if all are alike.
     """
 
     values: Grey
@@ -161,17 +154,11 @@ class Template:
 
 @dataclass(frozen=True, eq=False)
 class Relief:
-    """The relief of a patch off its plane, and its pixels that are not part of the surface.
+    """The relief off its plane of the patch around a camera's pixel (2,).
 
-    Attributes
-    ----------
-    pixel_px
-        (2,) the pixel of a camera that the patch surrounds.
-    inverse_m, sigma_inverse_m
-        (n, n) float32, n odd: by how much the inverse range of each of the camera's pixels there is larger
-        than the plane's, 1/m; and one sigma of it at ``pixel_px``.
-    counts
-        (n, n) float32, 1 for pixels that belong to the surface, 0 for others.
+    ``inverse_m`` (n, n), n odd, is by how much the inverse range of each of the camera's pixels there is
+    larger than the plane's, 1/m; ``sigma_inverse_m`` one sigma of it at ``pixel_px``. ``counts`` (n, n) is 1
+    for pixels that belong to the surface, 0 for others.
     """
 
     pixel_px: FloatArray

@@ -58,7 +58,6 @@ class PointingSettings:
     """Of a pixel for the position's covariance: noise and calibration. What the match in the other camera
     shows is added, so that a position on rough ground is reported as less sure."""
     small_half_px: int = 12  # half patch that is tried after a move where the usual one fits nowhere
-    """What may lie between the view that joints state and the one that an image shows."""
     match: MatchSettings = field(
         default_factory=partial(
             MatchSettings, roughness=0.02, rough_beside_relief=False, relief=0.01, least_lead=0.03
