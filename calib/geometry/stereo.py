@@ -11,6 +11,7 @@ the Hazcam as for the others. The text's 4.69 µm does not give them.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -100,21 +101,22 @@ def triangulate(
             f"left pixels of shape {pixels[0].shape} and right pixels of shape {pixels[1].shape} "
             "do not go together",
         ) from None
-    seen = _meeting(left, right, *(xy.reshape(-1, 2) for xy in both))
+    has_ray, sines, ranges_m, gaps_m, positions_m, rates, gap_rates = _meeting(
+        left, right, *(xy.reshape(-1, 2) for xy in both)
+    )
     refused = np.select(
-        [~seen.has_ray.all(axis=0), seen.sines < PARALLEL_RAD, ~(seen.ranges_m > 0.0).all(axis=1)],
+        [~has_ray.all(axis=0), sines < PARALLEL_RAD, ~(ranges_m > 0.0).all(axis=1)],
         ["bad_pixel", "parallel_rays", "behind_camera"],
         "",
     )
     if single and refused[0]:
-        raise _refusal(str(refused[0]), seen, (left, right), pixels)
-    rates = seen.rates_m_per_px
+        raise _refusal(str(refused[0]), (left, right), pixels, float(sines[0]), ranges_m[0])
     covariance = sigma_px * sigma_px * (rates @ rates.transpose(0, 2, 1))
     arrays: list[Any] = [
         np.where((refused == "").reshape(-1, *[1] * (one.ndim - 1)), one, np.nan)
-        for one in (seen.positions_m, covariance, np.sqrt(_dot(seen.gaps_m, seen.gaps_m)), seen.ranges_m)
+        for one in (positions_m, covariance, np.sqrt(_dot(gaps_m, gaps_m)), ranges_m)
     ]
-    arrays += [rates, seen.gap_m_per_px, refused]
+    arrays += [rates, gap_rates, refused]
     arrays = [one.reshape((*both[0].shape[:-1], *one.shape[1:]))[()] for one in arrays]
     for one in arrays:
         if isinstance(one, np.ndarray):
@@ -122,34 +124,17 @@ def triangulate(
     return Triangulation(*arrays)
 
 
-class _Meeting(NamedTuple):
-    """Where n pairs of rays come nearest: sines (n,) of their angles, ranges (n, 2), gaps (n, 3).
-
-    has_ray (2, n) of the left and the right pixels; positions (n, 3) with rates (n, 3, 4) and gap rates
-    (n, 4) to (left x, left y, right x, right y). Parallel rays and missing ones leave rows that mean nothing.
-    """
-
-    has_ray: NDArray[np.bool_]
-    sines: FloatArray
-    ranges_m: FloatArray
-    gaps_m: FloatArray
-    positions_m: FloatArray
-    rates_m_per_px: FloatArray
-    gap_m_per_px: FloatArray
-
-
 def _refusal(
-    code: str, seen: _Meeting, models: tuple[CameraModel, CameraModel], pixels: list[FloatArray]
+    code: str, models: Sequence[CameraModel], pixels: Sequence[FloatArray], sine: float, ranges_m: FloatArray
 ) -> NoStereoPoint:
     """Why two single pixels show no point, in numbers."""
     if code == "bad_pixel":
-        k = int(seen.has_ray[0, 0])  # the left one's fault if it has no ray
+        k = int(bool(models[0].ray(pixels[0]).valid))  # the left one's fault if it has no ray
         camera = f"{models[k].kind} camera{models[k].why_no_ray}"
         return NoStereoPoint(code, f"{SIDES[k]} pixel {pixels[k].tolist()} has no ray in this {camera}")
     if code == "parallel_rays":
-        text = f"the two rays are parallel to {seen.sines[0]:.2g} rad: no point where they meet"
-        return NoStereoPoint(code, text)
-    s1, s2 = seen.ranges_m[0]
+        return NoStereoPoint(code, f"the two rays are parallel to {sine:.2g} rad: no point where they meet")
+    s1, s2 = ranges_m
     return NoStereoPoint(
         code,
         f"the two rays diverge: they come nearest {s1:.4g} m along the left and {s2:.4g} m along the right "
@@ -157,8 +142,12 @@ def _refusal(
     )
 
 
-def _meeting(left: CameraModel, right: CameraModel, left_px: FloatArray, right_px: FloatArray) -> _Meeting:
-    """Return where the rays of pixels (n, 2) of both cameras come nearest."""
+def _meeting(
+    left: CameraModel, right: CameraModel, left_px: FloatArray, right_px: FloatArray
+) -> tuple[FloatArray, ...]:
+    """Where the rays of pixels (n, 2) of both cameras come nearest: which have a ray (2, n), sines (n,) of
+    the rays' angles, ranges (n, 2), gaps (n, 3), positions (n, 3) with rates (n, 3, 4) to (left x, left y,
+    right x, right y), and the gaps' rates (n, 4). Rows of parallel or missing rays mean nothing."""
     with np.errstate(all="ignore"):
         rays1, turn1, shift1 = left.ray_jacobian(left_px)
         rays2, turn2, shift2 = right.ray_jacobian(right_px)
@@ -191,7 +180,7 @@ def _meeting(left: CameraModel, right: CameraModel, left_px: FloatArray, right_p
             ],
             axis=1,
         )
-        return _Meeting(
+        return (
             np.array([rays1.valid, rays2.valid]),
             sines,
             np.concatenate([s1, s2], axis=1),

@@ -31,22 +31,13 @@ PATTERN = ((0.5, 0.5), (0.2, 0.25), (0.8, 0.75), (0.8, 0.25), (0.2, 0.75))
 
 @dataclass(frozen=True)
 class Placement:
-    """A place for a board, as it is requested.
+    """A place for a board, as it is requested."""
 
-    Attributes
-    ----------
-    range_m
-        From the head's axes to the board's middle.
-    bearing_deg, height_deg
-        To the right of pan zero, and above the height of the axes.
-    turned_deg
-        By how much its face is turned away from the head: to the head's right, and upwards.
-    """
-
-    range_m: float
-    bearing_deg: float
-    height_deg: float
+    range_m: float  # from the head's axes to the board's middle
+    bearing_deg: float  # to the right of pan zero
+    height_deg: float  # above the height of the axes
     turned_deg: tuple[float, float] = (0.0, 0.0)
+    """By how much its face is turned away from the head: to the head's right, and upwards."""
 
     def __str__(self) -> str:
         """The placement as one says it to a person."""

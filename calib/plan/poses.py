@@ -30,24 +30,14 @@ EDGE_PX = 6.0
 
 @dataclass(frozen=True, eq=False)
 class Sought:
-    """The requirements of a shot, and the head's limits.
+    """The requirements of a shot, and the head's limits."""
 
-    Attributes
-    ----------
-    in_board_m, sigma_px
-        (n, 3) all corners of the board, and the sigma of one.
-    least
-        Corners that a picture must show to be used; all of them for a board whose parts look alike.
-    one_sided
-        Whether the head itself approaches from one side: from which one then makes no difference.
-    """
-
-    in_board_m: FloatArray
-    sigma_px: float
-    least: int
+    in_board_m: FloatArray  # (n, 3) all corners of the board
+    sigma_px: float  # of one
+    least: int  # corners that a picture must show to be used; all for a board whose parts look alike
     pan_limits_rad: tuple[float, float]
     tilt_limits_rad: tuple[float, float]
-    one_sided: bool = False
+    one_sided: bool = False  # whether the head itself approaches from one side, whichever is requested
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +48,13 @@ class AttitudeChoice:
     expected_px: float
 
 
-def seen(known: Knowledge, sought: Sought, shot: BenchShot) -> BenchShot | None:
-    """Return the shot with the corners that each camera is expected to see, or None if none sees enough."""
+def seen(
+    known: Knowledge, sought: Sought, shot: BenchShot, cameras: Collection[str] = ()
+) -> BenchShot | None:
+    """Return the shot with the corners that some cameras, by default all, are expected to see; None if none
+    sees enough."""
     views = []
-    for name in known.rig.cameras:
+    for name in cameras or known.rig.cameras:
         inside = shown(known, sought, shot, name)
         if int(inside.sum()) >= sought.least:
             corners = sought.in_board_m[inside]
@@ -130,18 +123,11 @@ def next_shot(
 ) -> AttitudeChoice | None:
     """Return the next shot of a placed board for pointing to be best in the end; None if none shows it.
 
-    Parameters
-    ----------
-    shots, placement
-        What was taken, of every placement; and where the board is now.
-    avoid
-        Attitudes (pan, tilt), radians, that are no use, as where the board was not found.
-    ahead
-        How many more shots there will be of this placement, this one among them. They are chosen together:
-        the best one by itself is seldom the beginning of the best few.
+    ``shots`` were taken, of every placement. Attitudes (pan, tilt), radians, to ``avoid`` are no use, as
+    where the board was not found. ``ahead`` is how many more shots there will be of this placement, this one
+    among them. They are chosen together: the best one by itself is seldom the beginning of the best few.
     """
     base = with_board(known, shots, placement)
-    known, base, aim = _of_head(known, base, aim)
     here = [shot for shot in shots if shot.placement == placement]
     choices = list(candidates(known, sought, here, placement, avoid))
     if not choices:
@@ -169,26 +155,6 @@ def next_shot(
         tried = [*best, *range(len(choices) - len(sides), len(choices))]
         first = tried[int(np.argmin(_left_px(beside, added[tried], aim)))]
     return AttitudeChoice(choices[first], float(_left_px(base, added[[first]], aim)[0]))
-
-
-def _of_head(
-    known: Knowledge, base: FloatArray, aim: ExpectedPointing
-) -> tuple[Knowledge, FloatArray, ExpectedPointing]:
-    """The same without the cameras on the body, which see a board alike from every attitude: what is known of
-    all else (p + 6, p + 6) stays known."""
-    cameras = {name: camera for name, camera in known.rig.cameras.items() if camera.on == "head"}
-    if len(cameras) == len(known.rig.cameras):
-        return known, base, aim
-    rig = replace(known.rig, cameras=cameras, stereo={})
-    of_head = Knowledge(rig, known.boards, known.joint_sigma_rad)
-    names = set(of_head.names)
-    left = np.array([name in names for name in known.names])
-    mine = np.concatenate([left, np.ones(6, dtype=bool)])
-    scale = 1.0 / np.sqrt(np.diag(base)[~mine])
-    across = base[np.ix_(mine, ~mine)] * scale
-    own = base[np.ix_(~mine, ~mine)] * np.outer(scale, scale)
-    rest = base[np.ix_(mine, mine)] - across @ np.linalg.solve(own, across.T)
-    return of_head, rest, replace(aim, to_rig=aim.to_rig[:, left])
 
 
 def _together(base: FloatArray, added: FloatArray, aim: ExpectedPointing, count: int) -> list[int]:
@@ -244,8 +210,10 @@ def candidates(
 ) -> Iterator[BenchShot]:
     """Yield shots that show the board, apart from those taken, each from the side that is on the way.
 
-    A head that does not choose its side comes from where it stands: from the attitude of the last shot.
+    A head that does not choose its side comes from the attitude of the last shot. Cameras on the body see the
+    board alike from every attitude: they are left out.
     """
+    cameras = [name for name, camera in known.rig.cameras.items() if camera.on == "head"]
     useless = [*avoid, *((shot.pan_rad, shot.tilt_rad) for shot in here)]
     last = (here[-1].pan_rad, here[-1].tilt_rad) if here else (0.0, 0.0)
     for pan, tilt in _attitudes(known, sought, placement):
@@ -253,9 +221,9 @@ def candidates(
         if any(max(abs(a - pan), abs(b - tilt)) < 0.02 for a, b in useless):
             continue
         sides = (0, 0) if sought.one_sided else (1 if pan > last[0] else -1, 1 if tilt > last[1] else -1)
-        shown = seen(known, sought, BenchShot(placement, pan, tilt, (), *sides))
-        if shown is not None:
-            yield shown
+        shot = seen(known, sought, BenchShot(placement, pan, tilt, (), *sides), cameras)
+        if shot is not None:
+            yield shot
 
 
 def expected_px(known: Knowledge, shots: Sequence[BenchShot], aim: ExpectedPointing) -> float:
