@@ -1,16 +1,19 @@
-"""Cameras of this machine, without a daemon: camera list, check and focus."""
+"""Cameras of this machine, without a daemon: camera list, check, focus and sync."""
 
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
+import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli.options import command, option
-from mastctl.cli.output import Answer, Shown, WrongUse, check_file, tables_of
+from mastctl import signals
+from mastctl.cli.options import command, option, positive_number
+from mastctl.cli.output import Answer, Shown, WrongUse, check_file, chosen, tables_of, tell
 
 if TYPE_CHECKING:
     from drivers.hardware import HardwareSettings
@@ -106,6 +109,87 @@ def camera_focus(args: argparse.Namespace) -> Answer:
                 break
             time.sleep(0.5)
     return Answer({"sharpness": seen, "best": best}, ())
+
+
+@command(
+    "camera sync",
+    option("[NAME...]", "cameras on the head (default: all of the configuration)", dest="cameras"),
+    option("--config FILE", "default: the packaged simulated rover"),
+    option("--seconds S", "how long it turns", default=30.0),
+    option(
+        "--amplitude RAD",
+        "how far pan goes to either side (default 0.07, or 0.15 of the narrowest view)",
+        type=positive_number,
+    ),
+    option(
+        "--speed RAD_PER_S",
+        "of the fastest turns (default five amplitudes a second, or the limit)",
+        type=positive_number,
+    ),
+    help="measure how late the stamps are against the joints; turns the head to and fro",
+    example="navcam_left navcam_right --config rover.yaml",
+)
+def camera_sync(args: argparse.Namespace) -> Answer:
+    """Measure each camera's offset_s; 1 if none could be measured."""
+    from drivers.clock import SystemClock
+    from mastctl.config import load_config
+    from mastctl.devices.opening import devices_beside
+    from mastctl.service.masts import bounds_of
+    from mastctl.setup.sync_sweep import Sweep, plan_sweep
+
+    config = load_config(args.config)
+    bounds = bounds_of(config)
+    assert bounds.stored is not None
+    rig = bounds.stored.rig
+    on_head = [name for name in config.hardware.cameras if rig.cameras[name].on == "head"]
+    for name in args.cameras:
+        if name not in on_head:
+            known = ", ".join(on_head) or "none"
+            raise WrongUse(f"camera {name} is not on the head in {config.path}; on the head are {known}")
+    if not on_head:
+        raise WrongUse(f"{config.path} has no camera on the head")
+    names = list(dict.fromkeys(args.cameras)) or on_head
+    plan = plan_sweep(rig, names, config.limits, args.amplitude, args.speed, args.seconds)
+    settings, clock = with_cameras(config, names), SystemClock()
+    opened = devices_beside(settings, bounds, clock, moves=True, own_cameras=True)
+    with _ending_signals() as stop, opened as (devices, cameras):
+        sweep = Sweep(devices, cameras, rig, config.limits, stop, clock)
+        if not args.json:
+            tell(
+                f"turning pan {plan.amplitude_rad:.3f} rad to either side for {plan.seconds:g} s, "
+                f"at {plan.speed_rad_per_s:.3f} rad/s at most; Ctrl-C stops the head"
+            )
+        sweep.run(plan)
+    found = {name: sweep.found(name, settings.cameras[name].offset_s) for name in names}
+    notes = [one["warning"] for one in found.values() if one["warning"]]
+    if len(notes) == len(found) > 1:
+        notes.append("where all are off by the same, the head's readings may as well be stamped wrong")
+    notes += [f"{name}: {one['failure']}" for name, one in found.items() if one["failure"]]
+    measured = {name: one for name, one in found.items() if one["offset_s"] is not None}
+    lines = [
+        f"for the configuration: cameras.{name}.offset_s: {one['offset_s']:.5f}"
+        for name, one in measured.items()
+    ]
+    keys = "left_s sigma_s frames rolling_s play_rad"
+    rows = [{"camera": name, **chosen(one, keys)} for name, one in measured.items()]
+    tables = tables_of({"left_s: pictures later than their stamps": rows}, "camera sync") if rows else []
+    document = {"cameras": found, "sweep": vars(plan), "notes": notes}
+    return Answer(document, [*tables, *lines, *notes], 0 if measured else 1)
+
+
+@contextmanager
+def _ending_signals() -> Iterator[threading.Event]:
+    """An event that every ending signal sets, so that the head is stopped before the program ends."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before = {number: signal.signal(number, lambda *ignored: stop.set()) for number in signals.wanted()}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

@@ -42,7 +42,7 @@ OVERVIEW: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "reset": ("stop", "release an emergency stop; nothing moves by that"),
     },
     "geometry, on files": {
-        "camera": ("camera_files cameras camera_sync requests", "camera files, and cameras on this machine"),
+        "camera": ("camera_files cameras requests", "camera files, and cameras on this machine"),
         "solve": ("geometry", "the true joint angles that bring a target onto a pixel"),
         "triangulate": ("geometry", "the point that a stereo pair sees, with covariance"),
         "handoff": ("geometry", "where a target seen by one stereo pair falls in another"),

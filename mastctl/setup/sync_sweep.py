@@ -11,20 +11,25 @@ import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from drivers.clock import Clock
 from drivers.errors import DriverError, NoReply
-from drivers.interfaces import Camera, Frame, Reading
+from drivers.interfaces import Camera, Frame, Image, Reading
 from mastctl.devices.devices import Devices
 from mastctl.devices.judge import Limits
+from mastctl.devices.thread import DeviceThread
 from mastctl.errors import MastctlError, Stopped
-from mastctl.setup.sync_fit import REACH_S, OffsetFit, fit_offset
-from mastctl.setup.sync_motion import CannotTell, JointMotion, Patches, choose_patches
+from mastctl.setup.sync_fit import REACH_S, CannotTell, JointMotion, OffsetFit, fit_offset
 
+SIGNIFICANT_SIGMAS = 3.0
+LEAST_S = 0.0005  # an offset that small needs no correction
 SPEEDS = (1.0, 0.4, 0.7)  # parts of the chosen speed, an odd number, so that each goes both ways
 USUAL_AMPLITUDE_RAD = 0.07
 MOST_OF_VIEW = 0.15  # of the narrowest camera's view, to either side
@@ -140,14 +145,17 @@ class Sweep:
             self._limits.check(*goal)
             self._devices.judge.check_move(goal, lambda: start)
         self._limits.speed(plan.speed_rad_per_s)
+        for name in self._cameras:
+            self._choose(name, start, plan)
+        self._check_stop()
         threads = [
-            self._clock.thread(partial(self._follow, name, start, plan), f"sweep {name}")
-            for name in self._cameras
+            self._clock.thread(partial(self._follow, name), f"sweep {name}")
+            for name, seen in self.seen.items()
+            if not seen.failure
         ]
         for thread in threads:
             thread.start()
         try:
-            self._wait_for_choices()
             if self._to_and_fro(start, plan):
                 self._go(start.pan_rad, start.tilt_rad, plan.speed_rad_per_s)
         except BaseException:
@@ -175,6 +183,35 @@ class Sweep:
             return fit_offset(motion, np.array(seen.stamps_s), np.array(seen.places_px), seen.patches.rows)
         except CannotTell as error:
             raise CannotTell(f"{error}; {seen.failure}" if seen.failure else str(error)) from None
+
+    def found(self, camera: str, in_use_s: float) -> dict[str, Any]:
+        """Return a camera's result as JSON; ``offset_s`` is null, and ``failure`` says why, if there is none.
+
+        ``in_use_s`` is the offset that its stamps have already; ``left_s`` is what is left beside it.
+        """
+        seen = self.seen[camera]
+        found: dict[str, Any] = {
+            "offset_s": None,
+            "sigma_s": None,
+            "in_use_s": in_use_s,
+            "stated_uncertainty_s": seen.uncertainty_s,
+            "seen_frames": len(seen.stamps_s),
+            "warning": None,
+            "failure": None,
+        }
+        try:
+            fit = self.fit(camera)
+        except CannotTell as error:
+            return found | {"failure": str(error)}
+        beyond_s = SIGNIFICANT_SIGMAS * fit.sigma_s + seen.uncertainty_s
+        if abs(fit.offset_s) > max(beyond_s, LEAST_S):
+            side = "later" if fit.offset_s > 0 else "earlier"
+            found["warning"] = (
+                f"{camera}: its pictures were taken {1e3 * abs(fit.offset_s):.1f} ms {side} than its stamps "
+                f"say, which contradicts them: {1e3 * beyond_s:.1f} ms are explained (three sigma, and "
+                f"{1e3 * seen.uncertainty_s:.1f} ms that the driver states)"
+            )
+        return found | vars(fit) | {"offset_s": in_use_s + fit.offset_s, "left_s": fit.offset_s}
 
     def _check_stop(self) -> None:
         if self._stop.is_set():
@@ -205,16 +242,6 @@ class Sweep:
                 raise NoReply("the head does not come to rest", device="pan_tilt")
             self._pause()
 
-    def _wait_for_choices(self) -> None:
-        """Wait until for each camera patches are chosen or it is known why not."""
-        until_s = self._clock.now_s() + FRAME_TIMEOUT_S + GRACE_S
-        while waiting := [one for one in self.seen.values() if one.patches is None and not one.failure]:
-            if self._clock.now_s() > until_s:
-                for seen in waiting:
-                    seen.failure = "its driver did not come back from next_frame in time"
-                return
-            self._pause()
-
     def _to_and_fro(self, start: Reading, plan: SweepPlan) -> int:
         """Turn for the plan's time, and return how many ways that made: no more than any camera sees."""
         until_s = self._clock.now_s() + plan.seconds
@@ -238,31 +265,31 @@ class Sweep:
                 raise NoReply(f"the head does not come to pan {pan_rad:.3f} rad", device="pan_tilt")
             self._pause()
 
-    def _choose(self, name: str, start: Reading, plan: SweepPlan) -> Patches:
-        """Take a camera's image at rest and choose what to follow in it."""
-        frame = self._cameras[name].next_frame(self._clock.now_s(), FRAME_TIMEOUT_S)
-        joints_rad = self._rig.joints.true_rad((start.pan_rad, start.tilt_rad))
-        return choose_patches(frame.image, self._rig, name, joints_rad, plan.amplitude_rad)
-
-    def _follow(self, name: str, start: Reading, plan: SweepPlan) -> None:
-        """In a thread of its own: choose patches of an image at rest, and find them in what comes."""
-        seen, camera = self.seen[name], self._cameras[name]
+    def _choose(self, name: str, start: Reading, plan: SweepPlan) -> None:
+        """Take a camera's image at rest and choose what to follow in it; its failure is in `seen`."""
+        camera, thread = self._cameras[name], DeviceThread(name, clock=self._clock)
         try:
-            patches = self._choose(name, start, plan)
+            after_s = self._clock.now_s()
+            frame = thread.call(
+                "next_frame", lambda: camera.next_frame(after_s, FRAME_TIMEOUT_S), FRAME_TIMEOUT_S + GRACE_S
+            )
+            joints_rad = self._rig.joints.true_rad((start.pan_rad, start.tilt_rad))
+            self.seen[name].patches = choose_patches(
+                frame.image, self._rig, name, joints_rad, plan.amplitude_rad
+            )
         except (DriverError, MastctlError) as error:
-            seen.failure = str(error)
-            return
-        except Exception as error:  # a foreign driver may raise anything
-            seen.failure = f"its driver failed in next_frame: {type(error).__name__}: {error}"
-            return
-        if seen.failure:  # it took too long: the head may be turning already
-            return
-        seen.patches = patches
+            self.seen[name].failure = str(error)
+        finally:
+            thread.end()
+
+    def _follow(self, name: str) -> None:
+        """In a thread of its own: find a camera's patches in what comes."""
+        seen, camera = self.seen[name], self._cameras[name]
         lost, after_s = 0, self._clock.now_s()
         while not self._over.is_set():
             try:
                 frame = camera.next_frame(after_s, FRAME_TIMEOUT_S)
-                self._take(seen, patches, frame)
+                self._take(seen, frame)
                 after_s, lost = max(after_s, frame.mid_exposure_s - frame.exposure_s / 2), 0
             except Exception as error:  # a foreign driver may raise anything
                 lost += 1
@@ -272,13 +299,136 @@ class Sweep:
                     return
                 self._clock.sleep(0.05)
 
-    def _take(self, seen: Sightings, patches: Patches, frame: Frame) -> None:
+    def _take(self, seen: Sightings, frame: Frame) -> None:
+        assert seen.patches is not None
         stamp_s = float(frame.mid_exposure_s)
         seen.came_after_s = min(seen.came_after_s, self._clock.now_s() - stamp_s)
         if seen.stamps_s and stamp_s <= seen.stamps_s[-1]:
             self._clock.sleep(0.002)  # the same one again
             return
-        places_px = patches.places_px(frame.image)
+        places_px = seen.patches.places_px(frame.image)
         seen.uncertainty_s = float(getattr(frame, "mid_uncertainty_s", 0.0))
         seen.stamps_s.append(stamp_s)
         seen.places_px.append(places_px)
+
+
+HALF_PX = 15
+MOST_PATCHES = 12
+LEAST_CORRELATION = 0.6  # motion blurs the pictures that are compared with one at rest
+LEAST_LEAD = 0.05  # before the best place elsewhere
+APART_PX = 6
+PAD_PX = 12
+NEAR = 1.4  # so much further than infinitely distant things do near ones move
+FAR_M = 1e5
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Patches of one camera's image, (2 HALF_PX + 1) squares of grey, and where each is searched.
+
+    ``centres_px`` (p, 2) are their places in the image at rest, ``windows_px`` (p, 4) the corners (x0, y0,
+    x1, y1), inclusive, of where their centres may come to lie, ``ways`` (p, 2) the unit vectors along which
+    they move, and ``rows`` (p,) their rows in image heights from the middle.
+    """
+
+    templates: tuple[Image, ...]
+    centres_px: FloatArray
+    windows_px: FloatArray
+    ways: FloatArray
+    rows: FloatArray
+
+    def places_px(self, image: Image) -> FloatArray:
+        """Return the (p,) places along their ways in a picture; not-a-number where a patch is not found."""
+        picture = grey_bytes(image)
+        return np.array([self._place_px(picture, number) for number in range(len(self.templates))])
+
+    def _place_px(self, picture: Image, number: int) -> float:
+        x0, y0, x1, y1 = self.windows_px[number].astype(int)
+        part = picture[y0 - HALF_PX : y1 + HALF_PX + 1, x0 - HALF_PX : x1 + HALF_PX + 1]
+        score = cv2.matchTemplate(part, self.templates[number], cv2.TM_CCOEFF_NORMED)
+        _, best, _, (x, y) = cv2.minMaxLoc(score)
+        height, width = score.shape
+        if best < LEAST_CORRELATION or not (0 < x < width - 1 and 0 < y < height - 1):
+            return np.nan
+        offset = np.array([_peak(*score[y, x - 1 : x + 2]), _peak(*score[y - 1 : y + 2, x])])
+        place = np.array([x0 + x, y0 + y]) + offset - self.centres_px[number]
+        score[max(0, y - APART_PX) : y + APART_PX + 1, max(0, x - APART_PX) : x + APART_PX + 1] = -1.0
+        if best - float(score.max()) < LEAST_LEAD:
+            return np.nan
+        return float(place @ self.ways[number])
+
+
+def grey_bytes(image: Image) -> Image:
+    """Return a picture's grey levels, bytes, (h, w)."""
+    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
+
+
+def choose_patches(
+    image: Image, rig: Rig, camera: str, joints_rad: tuple[float, float], amplitude_rad: float
+) -> Patches:
+    """Choose textured patches that stay in the image while pan goes ``amplitude_rad`` to either side.
+
+    ``image`` is of a head at rest at ``joints_rad`` (pan, tilt). ``rig`` predicts roughly where things go;
+    the measurement does not use it. Raises CannotTell if nothing differs from its surroundings.
+    """
+    picture = grey_bytes(image)
+    height, width = picture.shape
+    corners = cv2.goodFeaturesToTrack(picture, 400, 0.02, 2 * HALF_PX, blockSize=9, useHarrisDetector=False)
+    if corners is None:
+        raise CannotTell("the scene is too plain: nothing in the picture can be followed")
+    centres = np.rint(corners.reshape(-1, 2)).astype(np.float64)
+    ends = np.stack([moved_px(rig, camera, joints_rad, side * amplitude_rad, centres) for side in (-1, 1)])
+    moves = NEAR * (ends - centres)
+    low = np.floor(np.minimum(centres + moves.min(axis=0), centres) - PAD_PX)
+    high = np.ceil(np.maximum(centres + moves.max(axis=0), centres) + PAD_PX)
+    inside = np.isfinite(moves).all(axis=(0, 2))
+    inside &= (low >= HALF_PX).all(axis=1) & (high <= np.array([width, height]) - 1 - HALF_PX).all(axis=1)
+    chosen = _spread(centres, np.flatnonzero(inside), height)
+    if not len(chosen):
+        raise CannotTell(
+            "nothing that can be followed stays in the picture; a smaller --amplitude, or a view with more "
+            "texture in its middle, is expected"
+        )
+    ways = (ends[1] - ends[0])[chosen]
+    return Patches(
+        templates=tuple(_square(picture, centre) for centre in centres[chosen]),
+        centres_px=centres[chosen],
+        windows_px=np.hstack([low, high])[chosen],
+        ways=ways / np.linalg.norm(ways, axis=1, keepdims=True),
+        rows=(centres[chosen, 1] - (height - 1) / 2) / height,
+    )
+
+
+def moved_px(
+    rig: Rig, camera: str, joints_rad: tuple[float, float], pan_by_rad: float, pixels_px: FloatArray
+) -> FloatArray:
+    """Return where far things at (n, 2) pixels come to lie when pan goes further; nan out of reach."""
+    model = rig.cameras[camera].model
+    pan_rad, tilt_rad = joints_rad
+    rays = model.ray(pixels_px)
+    far = rig.mast.rover_from_head(pan_rad, tilt_rad).points(rays.origins_m + FAR_M * rays.directions)
+    back = rig.mast.rover_from_head(pan_rad + pan_by_rad, tilt_rad).inverse.points(far)
+    found: FloatArray = model.project(back)[0]
+    return found
+
+
+def _spread(centres_px: FloatArray, allowed: NDArray[np.intp], height: int) -> NDArray[np.intp]:
+    """Choose the best corners (they come best first) of each of four strips of rows by turns."""
+    strips = [[i for i in allowed if int(4 * centres_px[i, 1] / height) == strip] for strip in range(4)]
+    chosen: list[int] = []
+    while len(chosen) < MOST_PATCHES and any(strips):
+        for strip in strips:
+            if strip and len(chosen) < MOST_PATCHES:
+                chosen.append(strip.pop(0))
+    return np.array(chosen, dtype=np.intp)
+
+
+def _square(picture: Image, centre_px: FloatArray) -> Image:
+    x, y = centre_px.astype(int)
+    return picture[y - HALF_PX : y + HALF_PX + 1, x - HALF_PX : x + HALF_PX + 1].copy()
+
+
+def _peak(before: float, at: float, after: float) -> float:
+    """Where a parabola through three neighbours has its top, from the middle one."""
+    bend = before - 2 * at + after
+    return 0.0 if bend >= 0 else 0.5 * (before - after) / bend

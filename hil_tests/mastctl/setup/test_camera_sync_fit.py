@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from mastctl.setup.sync_fit import OffsetFit, fit_offset
-from mastctl.setup.sync_motion import CannotTell, JointMotion
+from mastctl.setup.sync_fit import CannotTell, JointMotion, OffsetFit, fit_offset
 
 
 @dataclass(frozen=True)
