@@ -80,12 +80,28 @@ class BenchResult(TypedDict):
     rover_seconds: float | None
 
 
-class BenchRunRecord(TypedDict):
-    """A bench calibration as far as it is known; ``asking`` waits for a placement.
+class BenchProgress(TypedDict):
+    """How far a bench calibration is.
 
-    ``pictures``, ``most``: of the camera with most, and at most; ``predicted_px``, ``target_px``,
-    ``counts_px``: what the calibration leaves of a first pointing, may leave, and what counts alone leave;
-    ``expected_px``: what it leaves after a picture at ``next_rad``; ``curve``: pictures and ``predicted_px``.
+    ``placements`` at which the board was seen; ``pictures`` of the camera with most; ``predicted_px``,
+    ``target_px``, ``counts_px``: rms per axis of a first pointing that the calibration leaves, may leave, and
+    that counts alone leave; ``expected_px``: what it leaves after a picture at ``next_rad``.
+    """
+
+    placements: Count
+    pictures: Count
+    predicted_px: float | None
+    target_px: float | None
+    counts_px: float | None
+    expected_px: float | None
+    next_rad: Angles | None
+    cameras: dict[str, Coverage]
+
+
+class BenchRunRecord(BenchProgress):
+    """A bench calibration as far as it is known; ``waiting`` is for a placement.
+
+    ``most`` pictures of a camera; ``curve``: pictures and ``predicted_px``.
     """
 
     name: str
@@ -99,16 +115,8 @@ class BenchRunRecord(TypedDict):
     by_hand: bool
     wanted_px: float
     board_m: Pair | None
-    asked: RequestedPlacement | None
-    placements: Count
-    pictures: Count
+    requested: RequestedPlacement | None
     most: Count
-    predicted_px: float | None
-    target_px: float | None
-    counts_px: float | None
-    expected_px: float | None
-    next_rad: Angles | None
-    cameras: dict[str, Coverage]
     curve: list[Pair]
     sentences: list[str]
     result: BenchResult | None

@@ -17,7 +17,7 @@ WELL: frozenset[Word] = frozenset({"ready", "moving", "tracking", "holding"})
 """States in which a command is carried out."""
 OperationState = Literal["queued", "running", "done", "failed", "stopped"]
 TrackState = Literal["idle", "starting", "tracking", "lost", "stopped"]
-BenchState = Literal["running", "asking", "done", "interrupted"]
+BenchState = Literal["running", "waiting", "done", "interrupted"]
 BenchStep = Literal["begin", "place", "search", "pictures", "check", "fit", "over"]
 MOST_CELLS = 48
 """Of a camera's picture, 8 in a row, 6 rows: where corners are counted."""

@@ -64,9 +64,11 @@ class Checked:
     @property
     def pointing_promised_px(self) -> float | None:
         """Rms of what was promised of them."""
-        if not self.pointings:
-            return None
-        return float(np.sqrt(np.mean([one.promised_px**2 for one in self.pointings])))
+        return (
+            float(np.sqrt(np.mean([one.promised_px**2 for one in self.pointings])))
+            if self.pointings
+            else None
+        )
 
 
 def unvisited(known: BenchKnowledge, placement: str, count: int) -> Iterator[BenchShot]:

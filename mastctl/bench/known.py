@@ -1,4 +1,4 @@
-"""What a run knows: all it has seen, the rig and boards that this makes, and how well the rig would point.
+"""The knowledge of a run: all that was seen, the rig that follows from it, and how well it would point.
 
 What is seen goes to the disk first. It is fitted beside the next moves, whenever there is a fifth more of it.
 """
@@ -13,17 +13,26 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.adjust.result import BenchCalibration
 from calib.adjust.solver import covariance_of
 from calib.errors import CalibError, Unreachable
 from calib.geometry.rigid import Rigid
 from calib.plan.knowledge import BenchShot, BoardView, ExpectedPointing, Knowledge, Workspace, pointing
 from calib.plan.placements import FEWEST, body_cameras
-from calib.plan.poses import Sought, expected_px, readings, rover_from_board, shown, with_board
+from calib.plan.poses import (
+    AttitudeChoice,
+    Sought,
+    expected_px,
+    readings,
+    rover_from_board,
+    shown,
+    with_board,
+)
+from calib.survey.records import Survey
 from calib.targets.boards import AnyBoard
-from mastctl.bench.folder import RunFolder, looks_of
-from mastctl.bench.frame import FitSurvey, FittedBench
+from mastctl.answers import MOST_CELLS, BenchProgress, Coverage
 from mastctl.bench.mast import BenchHead, BenchLook
-from mastctl.bench.reporter import CELLS
+from mastctl.bench.survey import RunFolder, fit_in_frame, frame_of, looks_of, moved_placements
 from mastctl.calibration.landing import first_cameras
 
 USUAL_PAN_RAD, USUAL_TILT_RAD = (-1.2, 1.2), (-0.9, 0.3)
@@ -36,6 +45,12 @@ CORNERS, APART = ((0.05, 0.05), (0.95, 0.95), (0.95, 0.05), (0.05, 0.95)), 0.15
 """Where in the picture of a camera that does not point the board's middle should have been, in parts of width
 and height, and how far from there, in parts of the view, it may have been instead."""
 
+CELLS = (8, MOST_CELLS // 8)
+"""Columns and rows into which an image is divided to count where corners were seen."""
+
+LEAST_PX, LEAST_SCALE = 0.01, 0.1
+"""No corner is surer than this, and none so much surer than its finder says; few pictures agree by chance."""
+
 BESIDE, BESIDE_AT_FIRST = 0.1, 0.5
 """So far outside a picture, in parts of its width, corners may be in it after all: after, before a fit."""
 
@@ -43,23 +58,16 @@ BESIDE, BESIDE_AT_FIRST = 0.1, 0.5
 class BenchKnowledge:
     """What was seen, what follows from it, and the fit of it that is under way.
 
-    ``kept`` is the survey's folder, whose looks are known already; ``fit`` makes a rig of the survey; ``say``
-    shows what a fit refuses. Of the estimate, ``now`` is the rig with the boards' places, ``sought`` what a
-    shot has to show, ``aim`` and ``workspace`` where the rig is to point. ``looks`` are placement, whether it
-    is the check's, and the look, in turn; ``shots`` what of them is fitted; ``fitted`` is the last fit, and
-    ``fitted_looks`` how many looks it knew.
+    ``kept`` is the survey's folder, whose looks are known already; ``say`` shows what a fit refuses. Of the
+    estimate, ``now`` is the rig with the boards' places, ``sought`` what a shot has to show, ``aim`` and
+    ``workspace`` where the rig is to point. ``looks`` are placement, whether it is the check's, and the look,
+    in turn; ``shots`` what of them is fitted; ``fitted`` is the last fit, and ``fitted_looks`` how many looks
+    it knew.
     """
 
-    def __init__(
-        self,
-        head: BenchHead,
-        kept: RunFolder,
-        board: AnyBoard,
-        fit: FitSurvey,
-        say: Callable[[str], None],
-    ) -> None:
+    def __init__(self, head: BenchHead, kept: RunFolder, board: AnyBoard, say: Callable[[str], None]) -> None:
         self.head, self.board, self.kept = head, board, kept
-        self._fit, self._say = fit, say
+        self._say = say
         self.workspace = Workspace(
             first_cameras(head.rig),
             _within(head.pan_limits_rad, USUAL_PAN_RAD),
@@ -76,11 +84,11 @@ class BenchKnowledge:
         self.aim: ExpectedPointing = pointing(self.now, self.workspace)
         self.looks: list[tuple[str, bool, BenchLook]] = list(looks_of(kept.survey()))
         self.shots: list[BenchShot] = []
-        self.fitted: FittedBench | None = None
+        self.fitted: BenchCalibration | None = None
         self.fitted_looks = 0
         self._scale = 1.0
         self._pool = ThreadPoolExecutor(1, "bench-fit")
-        self._pending: tuple[int, Future[FittedBench]] | None = None
+        self._pending: tuple[int, Future[BenchCalibration]] | None = None
 
     def end(self) -> None:
         """Fit no more."""
@@ -148,18 +156,33 @@ class BenchKnowledge:
                 if all((np.abs(np.subtract((one.pan_rad, one.tilt_rad), at)) > apart).any() for one in mine):
                     yield BenchShot(name, *at, ())
 
-    def cells(self) -> dict[str, tuple[int, ...]]:
-        """Return how many corners were seen in each of `CELLS` of each camera's picture, row by row."""
-        counts: dict[str, NDArray[np.int64]] = {}
+    def progress(self, target_px: float, choice: AttitudeChoice | None = None) -> BenchProgress:
+        """Return how far the run is, with the next attitude if one was chosen."""
+        predicted_px = self.predicted_px()
+        return {
+            "placements": len(self.placements()),
+            "pictures": self.pictures(),
+            "predicted_px": predicted_px if math.isfinite(predicted_px) else None,
+            "target_px": target_px,
+            "counts_px": self.counts_px,
+            "expected_px": None if choice is None else choice.expected_px,
+            "next_rad": None if choice is None else [choice.shot.pan_rad, choice.shot.tilt_rad],
+            "cameras": self._coverage(),
+        }
+
+    def _coverage(self) -> dict[str, Coverage]:
+        """How many corners were seen in each of `CELLS` of each camera's image, row by row."""
+        sizes = {name: camera.model.size_px for name, camera in self.now.rig.cameras.items()}
+        counts: dict[str, NDArray[np.int64]] = {name: np.zeros(MOST_CELLS, np.int64) for name in sizes}
         for _, check, look in self.looks:
             for one in () if check else look.found:
-                if one.corners is None or one.camera not in self.now.rig.cameras:
+                if one.corners is None or one.camera not in sizes:
                     continue
-                edges = [(-0.5, size - 0.5) for size in self.now.rig.cameras[one.camera].model.size_px]
+                edges = [(-0.5, size - 0.5) for size in sizes[one.camera]]
                 x, y = np.clip(one.corners.pixels_px, *np.transpose(edges)).T
                 found, _, _ = np.histogram2d(y, x, bins=CELLS[::-1], range=edges[::-1])
-                counts[one.camera] = counts.get(one.camera, 0) + found.astype(np.int64).ravel()
-        return {camera: tuple(found.tolist()) for camera, found in counts.items()}
+                counts[one.camera] += found.astype(np.int64).ravel()
+        return {name: {"size_px": list(size), "cells": counts[name].tolist()} for name, size in sizes.items()}
 
     def untied(self) -> list[str]:
         """Return the body cameras that have seen too few of the placements that the head saw."""
@@ -211,7 +234,7 @@ class BenchKnowledge:
         except CalibError as reason:
             self._say(f"no fit yet: {reason}")
 
-    def fit(self) -> FittedBench:
+    def fit(self) -> BenchCalibration:
         """Return the fit of everything that was seen. Raises CalibError if it cannot be fitted."""
         self.collect(wait=True)
         if self.fitted is None or self.fitted_looks < len(self.looks):
@@ -226,20 +249,26 @@ class BenchKnowledge:
                 board = self._board_from(look)
                 self.now = replace(self.now, boards={**self.now.boards, name: board})
         # What moved, and could not be fitted, tells nothing.
-        spoiled = set(self.kept.moved()) - set(self.fitted.boards) if self.fitted else set()
+        fitted = {placement for _, placement in self.fitted.rover_from_board} if self.fitted else set()
+        spoiled = set(moved_placements(self.kept.notes)) - fitted if self.fitted else set()
         self.shots = [
             self._shot(name, look) for name, check, look in self.looks if not check and name not in spoiled
         ]
 
-    def _use(self, fitted: FittedBench, looks: int) -> None:
+    def _fit(self, survey: Survey) -> BenchCalibration:
+        notes = self.kept.notes
+        return fit_in_frame(survey, frame_of(notes), self.head.rig, moved_placements(notes))
+
+    def _use(self, fitted: BenchCalibration, looks: int) -> None:
         """Let a fit of so many looks be the present estimate; boards that it does not know stay where they
         were seen."""
         self.fitted, self.fitted_looks = fitted, looks
         body = {n: c for n, c in self.head.rig.cameras.items() if c.on == "rover"}
         rig = replace(fitted.rig, cameras={**body, **fitted.rig.cameras})
-        self.now = replace(self.now, rig=rig, boards=dict(fitted.boards))
-        self._scale = fitted.sigma_scale
-        self.sought = replace(self.sought, sigma_px=fitted.corner_rms_px)
+        boards = {placement: pose for (_, placement), pose in fitted.rover_from_board.items()}
+        self.now = replace(self.now, rig=rig, boards=boards)
+        rms_px, self._scale = corner_noise(fitted, self.kept.survey())
+        self.sought = replace(self.sought, sigma_px=rms_px)
         self.aim = pointing(self.now, self.workspace)
         self.believe_boards()
 
@@ -260,6 +289,16 @@ class BenchKnowledge:
         )
         in_board_m = self.board.in_board_m(one.corners.ids)
         return rover_from_board(self.now.rig, one.camera, *true_rad, in_board_m, one.corners.pixels_px)
+
+
+def corner_noise(fit: BenchCalibration, survey: Survey) -> tuple[float, float]:
+    """Return the rms of fitted corners, px an axis, and how large it is against the corners' own sigmas."""
+    rms_px = float(np.sqrt(np.mean(np.square(list(fit.rms_px.values())))))
+    # Corners were fitted with what print and lens add; those that a run plans with come without it.
+    fitted_px = np.median(np.concatenate([image.sigma_px for image in fit.images]))
+    own_px = np.median(np.concatenate([one.sigma_px for one in survey.corners.values()]))
+    scale = float(np.sqrt(fit.chi2 / max(fit.degrees_of_freedom, 1.0)) * fitted_px / own_px)
+    return max(rms_px, LEAST_PX), max(scale, LEAST_SCALE)
 
 
 def _worth_a_fit(looks: int, fitted: int) -> bool:

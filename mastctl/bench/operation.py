@@ -14,7 +14,7 @@ import signal
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from multiprocessing import get_context
@@ -24,34 +24,26 @@ from pathlib import Path
 from typing import Any, cast
 
 from calib.errors import BadFile
+from calib.files import replace_bytes
 from drivers.errors import DriverError
 from mastctl.answers import BenchRunRecord, BenchRuns, BenchState
-from mastctl.bench.runs import (
-    HOLDER,
-    BenchJob,
-    RunFiles,
-    Runs,
-    board_bytes,
-    known_boards,
-    new_record,
-    save_board,
-)
+from mastctl.bench.runs import HOLDER, BenchJob, RunFiles, Runs, board_bytes, known_boards, new_record
 from mastctl.control.lease import Caller, Lease, LeaseTable, StopCame
-from mastctl.control.publisher import Publisher, ThreadSubscription
+from mastctl.control.publisher import Publisher
 from mastctl.errors import BadRequest, MastctlError, NotNow, Unable
 
 log = logging.getLogger(__name__)
 
 LEASE_S, RENEW_S = 30.0, 8.0
 TICK_S = 0.25
-STOP_KNOWN_S = 2.0
-"""How long to wait for the record of a stop that has ended the lease already."""
-
 ENDS_S = 5.0
 FREE_BYTES = 500_000_000
 """Sixty pictures of two cameras take a tenth of it."""
 
 GOES_ON = "everything seen is kept, and the run can go on"
+
+Lend = Callable[[str], tuple[str, Callable[[], None]]]
+"""Returns a token for a client of this name, and what revokes it."""
 
 
 def carry_out(job: BenchJob, link: Connection) -> None:
@@ -79,15 +71,8 @@ class _Work:
 class BenchOperation:
     """The bench calibrations of one daemon; safe to use from any thread.
 
-    Parameters
-    ----------
-    masts_folder
-        Returns the folder of the daemon's mast files.
-    leases, publisher
-        Where the worker's right to steer comes from; where each change is published (topic ``bench``) and
-        stops are read.
-    simulated
-        Whether the rover is: only there the board may go where it is requested by itself.
+    ``masts_folder`` returns the folder of the daemon's mast files; each change is published under the topic
+    ``bench``. Only a ``simulated`` rover's board goes by itself where it is requested.
     """
 
     def __init__(
@@ -104,15 +89,15 @@ class BenchOperation:
         self._masts_folder, self._leases, self._publisher = masts_folder, leases, publisher
         self._simulated = simulated
         self._url = ""
-        self._lend: Callable[[str], tuple[str, Callable[[], None]]] | None = None
+        self._lend: Lend = lambda name: ("", lambda: None)
         self._starting = threading.Lock()
         self._changing = threading.Lock()
         self._work: _Work | None = None
         self._closed = False
 
-    def serve(self, url: str, lend: Callable[[str], tuple[str, Callable[[], None]]] | None = None) -> None:
-        """Let runs begin at an address; ``lend`` returns a token and what revokes it, where one is needed."""
-        self._url, self._lend = url, lend
+    def serve(self, url: str, lend: Lend | None = None) -> None:
+        """Let runs begin at an address; ``lend`` where clients need a token."""
+        self._url, self._lend = url, lend or self._lend
 
     @property
     def run(self) -> BenchRunRecord | None:
@@ -141,32 +126,18 @@ class BenchOperation:
         }
 
     def start(self, by: str, last_stop: StopCame | None = None, **wanted: Any) -> BenchRunRecord:
-        """Begin a run, or go on with one, and return it.
+        """Begin a run for a client of a name, or go on with one, and return it.
 
-        Parameters
-        ----------
-        by
-            The name of the client.
-        last_stop
-            `mastctl.control.lease.LeaseTable.last_stop` at its request: the next stop ends the worker's right
-            to steer, before the worker itself is ended. None: that of now.
-        wanted
-            The fields of `mastctl.web.models.BenchBody`.
+        The first stop after ``last_stop`` (`LeaseTable.last_stop` at its request; None: that of now) ends the
+        worker's right to steer, before the worker itself is ended. ``wanted`` are the fields of
+        `mastctl.web.models.BenchBody`.
 
-        Raises
-        ------
-        NotNow
-            ``bench_runs``; ``bench_done`` if the run that is to go on has its verdict.
-        NotKnown
-            ``bench_unknown``.
-        BadRequest
-            ``bad_board``, ``bad_run``.
-        Unable
-            ``unwritable``, ``disk_low``, ``no_process``, ``closing``.
+        Raises NotNow ``bench_runs``, ``bench_done`` if the run that is to go on has its verdict; NotKnown
+        ``bench_unknown``; BadRequest ``bad_board``, ``bad_run``; Unable ``unwritable``, ``disk_low``,
+        ``no_process``, ``closing``.
         """
-        with self._alone():
-            now = self.run
-            if now is not None and now["step"] != "over":
+        with self._alone() as now:
+            if now is not None:
                 raise NotNow(
                     "bench_runs", f"{now['by']} has a bench calibration running since {now['begun']}"
                 )
@@ -174,22 +145,17 @@ class BenchOperation:
                 raise Unable("closing", "a bench calibration begins only while the daemon serves")
             masts = self._masts_folder()
             _check_space(masts, self.runs.folder.parent)
-            folder, request = self._request(by, **wanted)
+            folder, request = self._request(by, wanted)
             return self._begin(folder, request, masts, last_stop or self._leases.last_stop)
 
     def stands(self) -> BenchRunRecord:
         """Pass on that the board stands where it was requested.
 
-        Raises
-        ------
-        NotNow
-            ``bench_idle``; ``nothing_asked`` if no placement is waited for.
-        Unable
-            ``no_process`` if the worker has ended.
+        Raises NotNow ``bench_idle``, ``nothing_requested``; Unable ``no_process`` if the worker has ended.
         """
         work = self._working()
-        if work.run["state"] != "asking":
-            raise NotNow("nothing_asked", "no placement is waited for just now")
+        if work.run["state"] != "waiting":
+            raise NotNow("nothing_requested", "no placement is waited for just now")
         try:
             work.link.send(True)
         except OSError:
@@ -203,22 +169,12 @@ class BenchOperation:
         return work.run
 
     def forget(self, name: str) -> BenchRuns:
-        """Remove a run that is over, with its pictures and report, and return what is left.
+        """Remove a run that is over, with its pictures and report but not its mast file; return the rest.
 
-        Its mast file stays where it is.
-
-        Raises
-        ------
-        NotNow
-            ``bench_runs`` for the run that is at work, or while one begins.
-        NotKnown
-            ``bench_unknown``.
-        Unable
-            ``unwritable``.
+        Raises NotNow ``bench_runs`` for the run that is at work, or while one begins; else as `Runs.forget`.
         """
-        with self._alone():
-            now = self.run
-            if now is not None and now["step"] != "over" and now["name"] == name:
+        with self._alone() as now:
+            if now is not None and now["name"] == name:
                 raise NotNow("bench_runs", f"run {name} is at work; end it first")
             self.runs.forget(name)
         return self.answer()
@@ -231,12 +187,12 @@ class BenchOperation:
             self._end(work, "interrupted", "closing", f"the daemon ended; {GOES_ON}")
 
     @contextlib.contextmanager
-    def _alone(self) -> Iterator[None]:
-        """Let nothing else begin or be removed meanwhile. Raises NotNow."""
+    def _alone(self) -> Iterator[BenchRunRecord | None]:
+        """Let nothing else begin or be removed meanwhile; yields the run at work, if any. Raises NotNow."""
         if not self._starting.acquire(blocking=False):
             raise NotNow("bench_runs", "another bench calibration begins just now")
         try:
-            yield
+            yield None if self.run is None or self.run["step"] == "over" else self.run
         finally:
             self._starting.release()
 
@@ -246,46 +202,39 @@ class BenchOperation:
             raise NotNow("bench_idle", "no bench calibration is at work")
         return work
 
-    def _request(
-        self,
-        by: str,
-        board: str | None = None,
-        board_file: str | None = None,
-        resume: str | None = None,
-        wanted_px: float | None = None,
-        pictures: int | None = None,
-        by_hand: bool | None = None,
-    ) -> tuple[RunFiles, dict[str, Any]]:
+    def _request(self, by: str, wanted: Mapping[str, Any]) -> tuple[RunFiles, dict[str, Any]]:
         """Return the run's folder with all that it needs, and what is requested of it."""
-        if resume is not None:
-            folder = self.runs.named(resume)
+        stated = {key: wanted.get(key) for key in ("wanted_px", "pictures", "by_hand")}
+        request: dict[str, Any] = {"wanted_px": 0.2, "pictures": 60, "by_hand": False}
+        if wanted.get("resume") is not None:
+            folder = self.runs.named(wanted["resume"])
             try:
                 before = folder.read()
                 before |= {"begun": str(before["begun"]), "mast_file": str(before["mast_file"])}
-            except (BadFile, KeyError) as error:
+            except BadFile as error:
+                raise BadRequest("bad_run", str(error)) from None
+            except KeyError as error:
                 missing = f"{error} is missing in {folder.path}; begin another run"
-                reason = str(error) if isinstance(error, BadFile) else missing
-                raise BadRequest("bad_run", reason) from None
+                raise BadRequest("bad_run", missing) from None
             if (before.pop("end", None) or {}).get("state") == "done":
                 raise NotNow("bench_done", f"run {folder.name} has its verdict; begin another")
         else:
-            data, described = board_bytes(board, board_file)
+            data, board = board_bytes(wanted.get("board"), wanted.get("board_file"))
             folder = self.runs.new()
-            save_board(folder, data)
-            width_mm, height_mm = (1000 * size_m for size_m in described.size_m)
+            width_mm, height_mm = (1000 * size_m for size_m in board.size_m)
             before = {
                 "begun": datetime.now(UTC).isoformat(timespec="seconds"),
                 "mast_file": f"bench-{folder.name}.yaml",
-                "board": f"{board or described.kind}, {width_mm:.0f} x {height_mm:.0f} mm",
+                "board": f"{wanted.get('board') or board.kind}, {width_mm:.0f} x {height_mm:.0f} mm",
             }
-        usual = {"wanted_px": 0.2, "pictures": 60, "by_hand": False}
-        now = {"wanted_px": wanted_px, "pictures": pictures, "by_hand": by_hand}
-        request = {**usual, **before, **{key: one for key, one in now.items() if one is not None}, "by": by}
+        request |= {**before, **{key: one for key, one in stated.items() if one is not None}, "by": by}
         request["by_hand"] = request["by_hand"] or not self._simulated
         try:
+            if wanted.get("resume") is None:
+                replace_bytes(folder.board, data, 0o644)
             folder.write(request)
-        except BadFile as error:
-            raise Unable("unwritable", str(error)) from None
+        except (BadFile, OSError) as error:
+            raise Unable("unwritable", f"{folder.path} cannot be written: {error}") from None
         return folder, request
 
     def _begin(
@@ -293,10 +242,10 @@ class BenchOperation:
     ) -> BenchRunRecord:
         inside = Caller(HOLDER, "operate", "inside")
         lease = self._leases.take(inside, f"{request['by']} began it", HOLDER, LEASE_S, last_stop)
-        token, revoke_token = (None, lambda: None) if self._lend is None else self._lend(HOLDER)
+        token, revoke_token = self._lend(HOLDER)
         run = new_record(folder.name, request, self._simulated)
         files = folder.board, folder.seen, masts / request["mast_file"], folder.report
-        job = BenchJob(run, self._url, lease.id, token, *files)
+        job = BenchJob(run, self._url, lease.id, token or None, *files)
         context = get_context("spawn")  # a fork would copy the daemon's threads half
         ours, its = context.Pipe()
         process = context.Process(target=self.work, args=(job, its), name=HOLDER, daemon=True)
@@ -316,7 +265,7 @@ class BenchOperation:
     def _follow(self, work: _Work) -> None:
         """Publish what the worker sends, renew its lease, and end the run where it must end."""
         renew_s = time.monotonic() + RENEW_S
-        with work.link, self._publisher.subscribe("command", known=False) as commands:
+        with work.link:
             while not work.over.is_set():
                 if wait([work.link], TICK_S):
                     try:
@@ -326,15 +275,17 @@ class BenchOperation:
                     if run["step"] == "over":
                         work.process.join(ENDS_S)  # published afterwards: the next client may steer then
                         return self._end(work, run["state"], run["code"], run["sentence"], run)
-                    self._change(work, run)
-                if self._leases.was_stopped(work.lease):
-                    return self._end(work, "interrupted", "stopped", f"{_stop_of(commands)}, {GOES_ON}")
+                    with self._changing:
+                        work.run = work.run if work.over.is_set() else run
+                    self._publish(work)
                 try:
                     if time.monotonic() >= renew_s or not self._leases.holds(work.lease.id):
                         self._leases.renew(work.lease.id, LEASE_S)
                         renew_s = time.monotonic() + RENEW_S
                 except MastctlError as error:
-                    return self._end(work, "interrupted", "taken", f"{error}; {GOES_ON}")
+                    reason = (getattr(error, "detail", None) or {}).get("how", error)
+                    code = "stopped" if self._leases.was_stopped(work.lease) else "taken"
+                    return self._end(work, "interrupted", code, f"{reason}; {GOES_ON}")
         return None
 
     def _died(self, work: _Work) -> None:
@@ -345,13 +296,6 @@ class BenchOperation:
         if code is not None and code < 0:
             how = f"was ended by signal {-code} ({signal.strsignal(-code)})"
         self._end(work, "interrupted", "program_ended", f"the calibration program {how}; {GOES_ON}")
-
-    def _change(self, work: _Work, run: BenchRunRecord) -> None:
-        with self._changing:
-            if work.over.is_set():
-                return
-            work.run = run
-        self._publish(work)
 
     def _end(
         self,
@@ -379,19 +323,18 @@ class BenchOperation:
         work.revoke_token()
         if work.process.pid is not None:
             work.process.join(ENDS_S)
-        said = [*work.run["sentences"], sentence] if run is None else run["sentences"]
-        last = {"state": state, "step": "over", "code": code, "sentence": sentence, "sentences": said}
-        if state == "done":
-            last["mast_file"] = work.request["mast_file"]
-        if work.folder.page.is_file():
-            last["report"] = work.folder.name
-        run = cast(BenchRunRecord, {**(run or work.run), **last})
+        sentences = [*work.run["sentences"], sentence] if run is None else run["sentences"]
+        last = {
+            "state": state, "step": "over", "code": code, "sentence": sentence, "sentences": sentences,
+            "mast_file": work.request["mast_file"] if state == "done" else None,
+            "report": work.folder.name if work.folder.page.is_file() else None,
+        }  # fmt: skip
+        work.run = cast(BenchRunRecord, {**(run or work.run), **last})
         try:
-            work.folder.write(work.request, run)
+            work.folder.write(work.request, work.run)
         except BadFile as error:
             log.error("how the bench calibration ended is not kept: %s", error)
-        work.run = run
-        (log.info if state == "done" else log.warning)("bench calibration %s: %s", run["name"], sentence)
+        (log.info if state == "done" else log.warning)("bench calibration %s: %s", work.run["name"], sentence)
         self._publish(work)
 
     def _publish(self, work: _Work) -> None:
@@ -399,31 +342,15 @@ class BenchOperation:
             self._publisher.publish("bench", "run", work.run)
 
 
-def _stop_of(commands: ThreadSubscription) -> str:
-    """Return the sentence of the stop that has ended the lease: its record follows the head's answer."""
-    until_s = time.monotonic() + STOP_KNOWN_S
-    while (left_s := until_s - time.monotonic()) > 0.0 and not commands.closed:
-        for record in (one.value for one in commands.wait(left_s)):
-            if record.get("command") in ("stop", "estop") and "ended" not in record:
-                stop = "stop" if record["command"] == "stop" else "the emergency stop"
-                still = record.get("result") == "ok"
-                head = "the head stands still" if still else "the head did not confirm it"
-                return f"{record.get('who', 'a client')} pressed {stop}; {head}"
-    return "a stop was requested"
-
-
 def _check_space(masts: Path, state: Path) -> None:
     """Pass if the mast file and the pictures can be written. Raises Unable."""
     try:
         with tempfile.TemporaryFile(dir=masts):
             pass
+        free = shutil.disk_usage(state).free
     except OSError as error:
         sentence = f"the mast file would go to {masts}, where this daemon cannot write"
         raise Unable("unwritable", f"{sentence}: {error.strerror or error}") from None
-    try:
-        free = shutil.disk_usage(state).free
-    except OSError as error:
-        raise Unable("unwritable", f"{state}: {error.strerror or error}") from None
     if free < FREE_BYTES:
         sentence = f"{free / 1e6:.0f} MB are free in {state} where {FREE_BYTES / 1e6:.0f} are needed"
         raise Unable("disk_low", sentence)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import KW_ONLY, dataclass, replace
@@ -15,9 +16,8 @@ from calib.geometry.rig import Rig
 from calib.survey.records import Survey
 from mastctl.as_json import as_json
 from mastctl.bench.check import Checked
-from mastctl.bench.frame import RoverFrame, fit_in_frame
-from mastctl.bench.reporter import Reporter, px
-from mastctl.bench.run import BenchRun
+from mastctl.bench.run import BenchRun, Reporter
+from mastctl.bench.survey import RoverFrame, fit_in_frame
 from mastctl.calibration.drawn import cells_seen
 from mastctl.calibration.landing import expected_pointing
 from mastctl.calibration.mast_file import fit_document, picked, save_new, with_fit
@@ -42,17 +42,10 @@ class NotReported(MastctlError):
 class BenchDone:
     """A bench that is over.
 
-    Attributes
-    ----------
-    checked
-        Measured at the end; None of a folder that was fitted again.
-    predicted_px, calibrated_px, counts_px
-        Rms per axis of a first pointing: as expected when pictures sufficed, by the calibration's own
-        covariance, and by counts alone.
-    seconds, placements, pictures
-        Of the rover's time; how many; of the camera with most.
-    page
-        The report.
+    ``checked``: measured at the end, None of a folder that was fitted again. ``predicted_px``,
+    ``calibrated_px``, ``counts_px``: rms per axis of a first pointing, as expected when pictures sufficed, by
+    the calibration's own covariance, and by counts alone. ``seconds`` are the rover's; ``pictures`` of the
+    camera with most; ``page``: the report.
     """
 
     survey: Survey
@@ -110,7 +103,7 @@ class BenchDone:
         for term in fit.terms:
             yield term.sentence
         yield from (f"{quantity}: {value}" for quantity, value in _worth(self))
-        yield from (f"held: {sentence}" for sentence in fit.gauges)
+        yield from (f"fixed: {sentence}" for sentence in fit.gauges)
         yield from (f"note: {sentence}" for sentence in fit.notes)
         yield from (f"left out: {outlier.sentence}" for outlier in fit.outliers[:10])
         yield f"mast file: {self.saved.path} ({self.saved.digest[:12]})"
@@ -133,18 +126,14 @@ class BenchDone:
 def finish(bench: BenchRun, reporter: Reporter, out: Path, report: Path | None) -> BenchDone:
     """Run a bench to its end, check it, and save its mast file and report.
 
-    Raises
-    ------
-    MastctlError, CalibError
-        As `BenchRun.run`; no mast file is written.
+    Raises as `BenchRun.run`; no mast file is written then.
     """
     bench.run()
     reporter.step("check")
     checked = bench.check()
     reporter.step("fit")
     known = bench.known
-    fit = known.fit().calibration
-    assert fit is not None
+    fit = known.fit()
     numbers = {
         "predicted_px": known.predicted_px(),
         "counts_px": known.counts_px,
@@ -165,12 +154,8 @@ def fit_again(
 ) -> BenchDone:
     """Fit a bench's folder again, and save its mast file and report; the rest is of `fit_in_frame`.
 
-    Raises
-    ------
-    SurveyRefused
-        If something is missing.
-    BenchNotFitted
-        If the images do not determine a rig; nothing is written.
+    Raises SurveyRefused if something is missing, BenchNotFitted if the images do not determine a rig; nothing
+    is written then.
     """
     checked_survey(survey)
     fit = fit_in_frame(survey, frame, former, moved)
@@ -272,3 +257,10 @@ def _pointings(checked: Checked | None) -> Table | None:
         for one in checked.pointings
     ]
     return Table(("corner", "range m", "turned deg", "residual x px", "y px", "promised sigma px"), rows)
+
+
+def px(value: float | None) -> str:
+    """Return pixels as a person reads them."""
+    if value is None or not math.isfinite(value):
+        return "? px"
+    return f"{value:.2f} px" if value < 10 else f"{value:.0f} px"

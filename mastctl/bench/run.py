@@ -6,33 +6,92 @@ from there. At its end are images that are not fitted, and pointings at corners,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Protocol
 
+import numpy as np
+
+from calib.adjust.result import BenchCalibration
 from calib.calibrate.starts.bench import SomethingChanged
 from calib.errors import CalibError
+from calib.plan.knowledge import BenchShot
 from calib.plan.placements import Advice, Placement, advise, advise_for_body, first_placement
+from calib.plan.poses import AttitudeChoice, next_shot
 from calib.survey.records import Sigma
 from calib.targets.boards import AnyBoard
+from mastctl.answers import BenchProgress, BenchStep
 from mastctl.bench.check import Checked, point_at_corners, unvisited
-from mastctl.bench.daemon_mast import DaemonMast
-from mastctl.bench.folder import RunFolder
-from mastctl.bench.frame import FitSurvey, FittedBench, RoverFrame, fit_in_rover, frame_of
 from mastctl.bench.known import BenchKnowledge
-from mastctl.bench.looks import FEWEST_LOOKS, BenchGoal, Looks, deg
-from mastctl.bench.mast import BenchMast
-from mastctl.bench.reporter import Reporter
-from mastctl.bench.simulated import SimulatedBoard
+from mastctl.bench.mast import (
+    BenchInterrupted,
+    BenchLook,
+    BenchMast,
+    DaemonMast,
+    NotThere,
+    SimulatedBoard,
+)
+from mastctl.bench.search import find_board
+from mastctl.bench.survey import RoverFrame, RunFolder
 from mastctl.client import Client
 from mastctl.errors import MastctlError
+
+FEWEST_LOOKS = 8
+"""Of a placement: fewer leave the board's own place, and so the information of its images, to chance."""
+
+LITTLE_GAIN, LAST_GAIN = 0.12, 0.01
+"""A look that promises less than this part of the predicted error is not worth its time at a placement, or at
+the last one that there may be."""
+
+MOVED_PX = 1.0
+"""Corners further off than this at one and the same attitude, on the median, say that something moved."""
+
+UNSEEN_IN_A_ROW = 4
+"""Looks in a row without the board where it was expected: it was taken away, or has moved."""
+
+
+class Reporter(Protocol):
+    """Shows the operator how a run goes, and has the board placed."""
+
+    def say(self, sentence: str) -> None:
+        """Show a sentence."""
+        ...
+
+    def step(self, step: BenchStep) -> None:
+        """Show what is done from now on."""
+        ...
+
+    def progress(self, now: BenchProgress) -> None:
+        """Show how far the run is."""
+        ...
+
+    def place(self, name: str, placement: Placement) -> None:
+        """Request a placement, and return when the board stands there."""
+        ...
+
+
+@dataclass(frozen=True)
+class BenchGoal:
+    """What a run is to reach, and when it stops trying.
+
+    ``pointing_px``: rms per axis of a first pointing that the calibration may leave, on paper;
+    ``pictures`` of a camera, at most, the check's among them; fewest and most ``placements``; ``checks`` that
+    are not fitted.
+    """
+
+    pointing_px: float = 0.2
+    pictures: int = 60
+    placements: tuple[int, int] = (2, 4)
+    checks: int = 5
 
 
 class BenchRun:
     """One run; `run` returns when nothing more is wanted.
 
-    ``kept`` is the survey's folder and the run's journal, ``fit`` makes a rig of the survey, ``simulated`` is
-    the board of a simulated rover. ``known`` is all that was seen, and what follows from it.
+    ``kept`` is the survey's folder and the run's journal, ``simulated`` the board of a simulated rover.
+    ``known`` is all that was seen, and what follows from it.
     """
 
     def __init__(
@@ -41,27 +100,23 @@ class BenchRun:
         kept: RunFolder,
         board: AnyBoard,
         reporter: Reporter,
-        fit: FitSurvey,
         wanted: BenchGoal,
         simulated: SimulatedBoard | None = None,
     ) -> None:
         self.wanted, self._mast, self._reporter, self._kept = wanted, mast, reporter, kept
         self._simulated = simulated
-        self.known = BenchKnowledge(mast.head, kept, board, fit, reporter.say)
-        self._looks = Looks(mast, self.known, reporter, wanted)
+        self.known = BenchKnowledge(mast.head, kept, board, reporter.say)
+        self._current = ""
+        """The placement that was worked at, and whose board so stands in place."""
 
-    def run(self) -> FittedBench:
+    def run(self) -> BenchCalibration:
         """Take pictures until they suffice, and return the fit of all of them.
 
-        Raises
-        ------
-        MastctlError
-            If the head or the cameras fail, the board is not found, or it is stopped. What was seen is in the
-            folder.
-        CalibError
-            If what was seen cannot be fitted; at the end of a placement already if something changed that no
-            more pictures mend.
+        Raises MastctlError if the head or the cameras fail, the board is not found, or it is stopped: what
+        was seen is in the folder. Raises CalibError if what was seen cannot be fitted; at the end of a
+        placement already if something changed that no more pictures mend.
         """
+        known = self.known
         try:
             self._take_up()
             while not self._enough():
@@ -69,23 +124,22 @@ class BenchRun:
                 self._reporter.place(name, placement)
                 if self._simulated is not None:
                     self._simulated.stand(placement)
-                self._kept.note(event="placement", name=name, asked=asdict(placement))
-                self._looks.find(name, placement)
-                self._looks.work_at(name, self._share())
-            return self.known.fit()
+                self._kept.note(event="placement", name=name, requested=asdict(placement))
+                self._reporter.step("search")
+                found = find_board(self._mast, known.now, known.sought, self._reporter.say, placement)
+                known.take(name, found)
+                self._work_at(name)
+            return known.fit()
         finally:
-            self.known.end()
+            known.end()
 
     def check(self) -> Checked:
-        """Look where nothing was fitted, and point at corners, where the board stands now.
+        """Capture images that are not fitted, and point at corners, where the board stands now.
 
-        Raises
-        ------
-        MastctlError
-            As `run`.
+        Raises MastctlError as `run`.
         """
         known, name = self.known, self.known.placements()[-1]
-        if self._looks.here != name and not self._looks.stands_still(name):
+        if self._current != name and not self._stands_still(name):
             self._reporter.say(f"not checked: the board does not stand any more as in placement {name}")
             return Checked({}, ())
         left = self.wanted.checks - sum(1 for _, check, _ in known.looks if check)
@@ -93,7 +147,7 @@ class BenchRun:
             self._reporter.say(
                 f"an image that is not fitted, at pan {deg(shot.pan_rad)}, tilt {deg(shot.tilt_rad)}"
             )
-            look = self._looks.look_at(shot, check=True)
+            look = self.look_at(shot, check=True)
             if look is not None and look.found:
                 known.take(name, look, check=True)
         checks = known.of(name, check=True)
@@ -115,15 +169,16 @@ class BenchRun:
         except CalibError as reason:
             self._reporter.say(f"not yet enough for a fit: {reason}")
             known.believe_boards()
+        self._report(None)
         name = known.placements()[-1]
         placement = self._kept.requested(name)
         if self._simulated is not None and placement is not None and not self._simulated.is_there:
             self._simulated.stand(placement)
         if self._kept.is_over(name):
             return
-        if self._looks.stands_still(name):
+        if self._stands_still(name):
             self._reporter.say(f"the board stands as it stood in placement {name}")
-            self._looks.work_at(name, self._share())
+            self._work_at(name)
         else:
             self._reporter.say(
                 f"the board does not stand any more as in placement {name}: that one is closed"
@@ -131,34 +186,34 @@ class BenchRun:
             self._kept.note(event="closed", name=name)
 
     def _enough(self) -> bool:
-        over = [name for name in self.known.placements() if self._kept.is_over(name)]
-        if len(over) >= self.wanted.placements[1] or self._room() <= 0:
+        known = self.known
+        over = [name for name in known.placements() if self._kept.is_over(name)]
+        if len(over) >= self.wanted.placements[1] or self._looks_left() <= 0:
             return True
         if not over:
             return False
         try:
-            self.known.fit()
+            known.fit()
         except SomethingChanged:
             raise  # no other placement mends it
         except CalibError as reason:
             self._reporter.say(f"no fit yet: {reason}")
         if len(over) < self.wanted.placements[0] or self._body_advice() is not None:
             return False
-        return self.known.predicted_px() <= self.wanted.at_least_px(self.known.counts_px)
+        return known.predicted_px() <= self._target_px()
 
     def _body_advice(self) -> Advice | None:
         """Where the board would tie body cameras to the head that are not tied yet."""
         known, untied = self.known, self.known.untied()
         return advise_for_body(known.now, known.sought, known.shots, untied) if untied else None
 
-    def _room(self) -> int:
+    def _looks_left(self) -> int:
         """Looks that may still be taken for the fit."""
         return self.wanted.pictures - self.wanted.checks - self.known.pictures()
 
-    def _share(self) -> int:
-        """How many looks one placement may have, so that there are some left for the others."""
-        left = max(self.wanted.placements[0] + 1 - len(self.known.placements()), 1)
-        return max(FEWEST_LOOKS, self._room() // left)
+    def _target_px(self) -> float:
+        """What the calibration may leave: as requested, or what counts leave anyway."""
+        return max(self.wanted.pointing_px, self.known.counts_px)
 
     def _next_placement(self) -> tuple[str, Placement]:
         known, name = self.known, f"p{len(self.known.placements()) + 1}"
@@ -168,6 +223,104 @@ class BenchRun:
         if advice is None:
             raise MastctlError("no place for the board can be seen within the head's limits")
         return name, advice.placement
+
+    def _work_at(self, name: str) -> None:
+        """Take the most informative images of a board that was found, until others would add more.
+
+        Some are left for the other placements. Raises BenchInterrupted ``board_lost``.
+        """
+        known, self._current = self.known, name
+        left = max(self.wanted.placements[0] + 1 - len(known.placements()), 1)
+        most = max(FEWEST_LOOKS, self._looks_left() // left)
+        self._reporter.step("pictures")
+        in_vain: list[tuple[float, float]] = []
+        missed = 0
+        while True:
+            taken = len(known.of(name))
+            known.collect()
+            ahead = max(FEWEST_LOOKS - taken, 1)
+            choice = next_shot(known.now, known.sought, known.shots, name, known.aim, in_vain, ahead)
+            if choice is None or taken >= most or self._suffices(taken, choice):
+                break
+            self._report(choice)
+            shot = choice.shot
+            look = self.look_at(shot)
+            if look is not None and look.found:
+                missed = 0
+                known.take(name, look)
+                continue
+            in_vain.append((shot.pan_rad, shot.tilt_rad))
+            if look is None:
+                continue
+            missed += 1
+            reason = "; ".join(dict.fromkeys(one.why for one in look.seen if one.why)) or "no corners found"
+            self._reporter.say(f"the board is not seen here: {reason}")
+            if missed >= UNSEEN_IN_A_ROW:
+                raise BenchInterrupted(
+                    f"the board of placement {name} was not seen in {missed} looks in a row where it stood "
+                    f"({reason}). Put it back or place it anew, and start the same command again",
+                    "board_lost",
+                )
+        for shot in known.round_others(name):
+            if self._looks_left() > 0:
+                look = self.look_at(shot)
+                if look is not None and look.found:
+                    known.take(name, look)
+        self._end(name)
+
+    def look_at(self, shot: BenchShot, check: bool = False) -> BenchLook | None:
+        """Take a shot; None where the head must not go."""
+        try:
+            return self._look(shot, self.known.cameras_for(shot, check))
+        except NotThere as reason:
+            self._reporter.say(f"no image was taken there: {reason}")
+            return None
+
+    def _stands_still(self, name: str) -> bool:
+        """Whether the last attitude of a placement shows now what it showed then."""
+        then = self.known.of(name)[-1]
+        apart_px = corners_apart_px(then, self._again(then))
+        return apart_px is not None and apart_px <= MOVED_PX
+
+    def _again(self, then: BenchLook) -> BenchLook:
+        """A look taken again, by the cameras that showed the board and those that point."""
+        return self._look(then, {*self.known.workspace.cameras, *(one.camera for one in then.found)})
+
+    def _look(self, where: BenchShot | BenchLook, cameras: Collection[str]) -> BenchLook:
+        at = where.pan_rad, where.tilt_rad, (where.pan_approach, where.tilt_approach)
+        every = len(cameras) == len(self.known.head.rig.cameras)
+        return self._mast.look(*at) if every else self._mast.look(*at, cameras)
+
+    def _suffices(self, taken: int, choice: AttitudeChoice) -> bool:
+        if taken < FEWEST_LOOKS:
+            return False
+        known = self.known
+        now_px = known.predicted_px()
+        if now_px <= 0.7 * self._target_px() and known.fitted_looks >= taken:
+            return True
+        last = len(known.placements()) >= self.wanted.placements[1]
+        return choice.expected_px > (1.0 - (LAST_GAIN if last else LITTLE_GAIN)) * now_px
+
+    def _end(self, name: str) -> None:
+        """Capture once more where the placement began: did the board, or the head, stay as it was?"""
+        known = self.known
+        then = known.of(name)[0]
+        now = self._again(then)
+        apart_px = corners_apart_px(then, now)
+        camera = known.head.rig.cameras[known.workspace.cameras[0]].model
+        # Two readings may differ by counts.
+        allowed_px = MOVED_PX + 3.0 * known.head.count_rad * float(np.linalg.norm(camera.H))
+        if apart_px is not None and apart_px > allowed_px:
+            self._reporter.say(
+                f"placement {name}: its first picture taken again shows the board {apart_px:.1f} px aside: "
+                "the board or the head moved meanwhile; the fit will show which, and when"
+            )
+            self._kept.note(event="moved", name=name, apart_px=round(apart_px, 2))
+            known.take(name, now)  # one more picture of how it is now
+        self._kept.note(event="done", name=name)
+
+    def _report(self, choice: AttitudeChoice | None) -> None:
+        self._reporter.progress(self.known.progress(self._target_px(), choice))
 
 
 def open_run(
@@ -181,12 +334,8 @@ def open_run(
 ) -> BenchRun:
     """Return a run on a daemon's head, which ``client`` may steer, with a new or former survey ``folder``.
 
-    Raises
-    ------
-    BadFile
-        If the folder holds something else, or another run keeps its looks there.
-    ClientError
-        If the daemon refuses a question.
+    Raises BadFile if the folder holds something else, or another run keeps its looks there; ClientError if
+    the daemon refuses a query.
     """
     status = client.status()
     mast = DaemonMast(client, cameras or list(status["cameras"]), board)
@@ -194,6 +343,23 @@ def open_run(
     sigma = Sigma(0.0, 0.0, joint_rad=head.count_rad / 12**0.5, corner_px=0.1)
     kept = RunFolder(folder, board, sigma, head.rig)
     kept.begin(client.mast_file(), frame or RoverFrame())
-    fit = fit_in_rover(frame_of(kept.notes), head.rig, kept.moved)
     simulated = SimulatedBoard(client, board, head.rig) if status["simulated"] else None
-    return BenchRun(mast, kept, board, reporter, fit, wanted, simulated)
+    return BenchRun(mast, kept, board, reporter, wanted, simulated)
+
+
+def corners_apart_px(then: BenchLook, now: BenchLook) -> float | None:
+    """Return how far corners lie apart in two looks from one attitude, median; None if none is common."""
+    apart: list[float] = []
+    before = {one.camera: one.corners for one in then.found}
+    for one in now.found:
+        old = before.get(one.camera)
+        if old is None or one.corners is None:
+            continue
+        _, a, b = np.intersect1d(old.ids, one.corners.ids, return_indices=True)
+        apart += np.linalg.norm(old.pixels_px[a] - one.corners.pixels_px[b], axis=1).tolist()
+    return float(np.median(apart)) if apart else None
+
+
+def deg(angle_rad: float) -> str:
+    """Return an angle as a person reads it."""
+    return f"{math.degrees(angle_rad):+.0f} degrees"

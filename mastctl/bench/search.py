@@ -1,10 +1,10 @@
-"""Looking for a board: first where it should stand, then ever further around it."""
+"""The search for a board: first where it should stand, then ever further around it."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -13,9 +13,7 @@ from calib.geometry.rig import Rig
 from calib.plan.knowledge import Knowledge
 from calib.plan.placements import Placement
 from calib.plan.poses import Sought, readings
-from mastctl.bench.mast import BenchLook, BenchMast, NoLight, NotThere
-from mastctl.bench.reporter import Reporter
-from mastctl.errors import MastctlError
+from mastctl.bench.mast import BenchInterrupted, BenchLook, BenchMast, NoLight, NotThere
 
 OVERLAP = 0.7
 """Of a picture's view: how far apart the looks of a search are."""
@@ -24,7 +22,7 @@ ANOTHER = ("another board", "mirrored", "two boards")
 """What `calib.targets.corners` says of a board in view that is not the one that is looked for."""
 
 MOST_LOOKS = 100
-"""A narrow view would take hundreds, a quarter of an hour: the operator is asked again before."""
+"""A narrow view would take hundreds, a quarter of an hour: the operator is consulted before."""
 
 LOOKS_BESIDE = 8
 """Looks after such a one: the right board may hang beside it."""
@@ -35,57 +33,51 @@ MOST_KINDS = 4
 _NUMBERS = re.compile(r"[-+]?[0-9][0-9.]*")
 
 
-class BoardNotFound(MastctlError):
-    """No look within the limits showed the board."""
-
-    code = "board_not_found"
-
-
 def find_board(
-    mast: BenchMast, known: Knowledge, sought: Sought, reporter: Reporter, placement: Placement
+    mast: BenchMast, known: Knowledge, sought: Sought, say: Callable[[str], None], placement: Placement
 ) -> BenchLook:
     """Return the first look that shows the board: where it should stand, then ever further around it.
 
-    Views without light or with nothing in them end nothing: the board may stand beside them.
-
-    Raises
-    ------
-    BoardNotFound
-        With what the images showed instead, and where.
+    Views without light or with nothing in them end nothing: the board may stand beside them. Raises
+    BenchInterrupted ``board_not_found`` with what the images showed instead, and where.
     """
     on_head = {name for name, camera in known.rig.cameras.items() if camera.on == "head"}
     attitudes = list(_attitudes(known.rig, sought, placement))
-    instead = _Instead()
+    instead: dict[str, tuple[str, list[str]]] = {}
+    looks = other_at = 0
+    everywhere = " all over the head's limits"
     for at_rad in attitudes:
         try:
             look = mast.look(*at_rad)
-        except NotThere as reason:
-            instead.add([str(reason)], at_rad)
+        except NotThere as error:
+            _note(instead, str(error), at_rad)
             continue
-        except NoLight as reason:
-            reasons = [str(reason).partition("; ")[0]]
+        except NoLight as error:
+            reasons = [str(error).partition("; ")[0]]
         else:
             if any(one.camera in on_head for one in look.found):
                 return look
             reasons = [one.why for one in look.seen if one.why]
-        instead.add(reasons, at_rad)
-        instead.looks += 1
-        if not instead.first_other and any(map(_is_another, reasons)):
-            instead.first_other = instead.looks
-        if instead.looks == 1:
+        looks += 1
+        for reason in dict.fromkeys(reasons):
+            _note(instead, reason, at_rad)
+        if not other_at and any(map(_is_another, reasons)):
+            other_at = looks
+        if looks == 1:
             most = min(len(attitudes), MOST_LOOKS) - 1
-            around = f"looking around, {most} looks at most"
-            reporter.say(f"the board is not where it was requested ({instead.summary}); {around}")
-        another = instead.first_other and instead.looks >= instead.first_other + LOOKS_BESIDE
-        if another or instead.looks == MOST_LOOKS:
+            say(
+                f"the board is not where it was requested ({_summary(instead)}); looking around, {most} "
+                "looks at most"
+            )
+        another = other_at and looks >= other_at + LOOKS_BESIDE
+        if another or looks == MOST_LOOKS:
             everywhere = "" if another else " around where it was requested"
             break
-    else:
-        everywhere = " all over the head's limits"
-    count = "1 look" if instead.looks == 1 else f"{instead.looks} looks"
-    raise BoardNotFound(
-        f"the board was not found in {count}{everywhere} ({instead.summary}); place it as "
-        "requested, in the light, facing the head, and start the same command again"
+    count = "1 look" if looks == 1 else f"{looks} looks"
+    raise BenchInterrupted(
+        f"the board was not found in {count}{everywhere} ({_summary(instead)}); place it as "
+        "requested, in the light, facing the head, and start the same command again",
+        "board_not_found",
     )
 
 
@@ -114,42 +106,29 @@ def _attitudes(rig: Rig, sought: Sought, placement: Placement) -> Iterator[tuple
     )
 
 
-class _Instead:
-    """What looks showed instead of the board, and where."""
+def _note(instead: dict[str, tuple[str, list[str]]], reason: str, at_rad: tuple[float, float]) -> None:
+    """Keep why an attitude shows no board; the same reason with other numbers is the same."""
+    pan, tilt = map(math.degrees, at_rad)
+    instead.setdefault(_NUMBERS.sub("", reason), (reason, []))[1].append(f"pan {pan:+.0f}, tilt {tilt:+.0f}")
 
-    def __init__(self) -> None:
-        self.looks = 0
-        self.first_other = 0
-        self._seen: dict[str, tuple[str, list[tuple[float, float]]]] = {}
 
-    def add(self, reasons: Sequence[str], at_rad: tuple[float, float]) -> None:
-        """Keep why an attitude shows no board; the same reason with other numbers is the same."""
-        for kind, reason in {_NUMBERS.sub("", reason): reason for reason in reasons}.items():
-            self._seen.setdefault(kind, (reason, []))[1].append(at_rad)
-
-    @property
-    def summary(self) -> str:
-        """What was seen, and where: another board first, then what most views showed."""
-        if not self._seen:
-            return "no corners were found"
-        found = sorted(self._seen.values(), key=lambda one: (not _is_another(one[0]), -len(one[1])))
-        kinds = [f"{reason}, {_place(places)}" for reason, places in found[:MOST_KINDS]]
-        more = len(found) - len(kinds)
-        return "; ".join([*kinds, f"{more} other reasons"] if more else kinds)
+def _summary(instead: dict[str, tuple[str, list[str]]]) -> str:
+    """What was seen, how often and where first: another board first, then what most views showed."""
+    if not instead:
+        return "no corners were found"
+    found = sorted(instead.values(), key=lambda one: (not _is_another(one[0]), -len(one[1])))
+    more = [f"{len(found) - MOST_KINDS} other reasons"] if len(found) > MOST_KINDS else []
+    times = [
+        f"{reason}, once at {places[0]} degrees"
+        if len(places) == 1
+        else f"{reason}, {len(places)} times, first at {places[0]} degrees"
+        for reason, places in found[:MOST_KINDS]
+    ]
+    return "; ".join([*times, *more])
 
 
 def _is_another(reason: str) -> bool:
     return any(part in reason for part in ANOTHER)
-
-
-def _place(attitudes_rad: Sequence[tuple[float, float]]) -> str:
-    """How often, and within which angles, as a person reads it."""
-    angles = []
-    for name, angles_rad in zip(("pan", "tilt"), zip(*attitudes_rad, strict=True), strict=True):
-        low, high = (f"{math.degrees(end(angles_rad)):+.0f}" for end in (min, max))
-        angles.append(f"{name} {low}" if low == high else f"{name} {low} to {high}")
-    times = "once" if len(attitudes_rad) == 1 else f"{len(attitudes_rad)} times"
-    return f"{times} at {', '.join(angles)} degrees"
 
 
 def _steps(low: float, high: float, middle: float, step: float) -> list[float]:

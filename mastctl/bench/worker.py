@@ -1,13 +1,12 @@
 """The process that carries a bench calibration out beside its daemon, whose head it turns as a client.
 
-Choosing poses and fitting keep a processor busy for minutes. In a process of their own they hold up no stop,
+Choosing poses and fitting keep a processor busy for minutes. In a process of their own they delay no stop,
 and the daemon can end them at once.
 """
 
 from __future__ import annotations
 
 import logging
-import math
 import os
 import threading
 from collections.abc import Mapping
@@ -17,12 +16,10 @@ from typing import Any, cast
 
 from calib.plan.placements import Placement
 from calib.targets.board_file import load_board
-from mastctl.answers import MOST_CELLS, BenchResult, BenchRunRecord, BenchStep
+from mastctl.answers import BenchProgress, BenchResult, BenchRunRecord, BenchStep
 from mastctl.as_json import as_json
-from mastctl.bench.looks import BenchGoal
-from mastctl.bench.reporter import BenchProgress
 from mastctl.bench.result import finish
-from mastctl.bench.run import open_run
+from mastctl.bench.run import BenchGoal, open_run
 from mastctl.bench.runs import HOLDER, BenchJob
 from mastctl.client import Client
 from mastctl.errors import error_body, one_line
@@ -44,16 +41,9 @@ def work(job: BenchJob, link: Connection) -> None:
         with Client(job.url, name=HOLDER, token=job.token) as client:
             client.use_lease(job.lease_id)
             board = load_board(job.board)
+            reporter.change(board_m=list(board.size_m))
             goal = BenchGoal(job.run["wanted_px"], job.run["most"])
             bench = open_run(client, board, job.survey, reporter, goal)
-            sizes = {name: camera.model.size_px for name, camera in bench.known.head.rig.cameras.items()}
-            reporter.change(
-                simulated=bool(client.status()["simulated"]),
-                board_m=list(board.size_m),
-                cameras={
-                    name: {"size_px": list(size), "cells": [0] * MOST_CELLS} for name, size in sizes.items()
-                },
-            )
             reporter.done(finish(bench, reporter, job.out, job.report).as_json())
     except Exception as error:
         body = error_body(error)
@@ -80,8 +70,8 @@ class LinkReporter:
 
     def say(self, sentence: str) -> None:
         """Add a sentence."""
-        said = [*self.run["sentences"], one_line(sentence, LONGEST_SENTENCE)]
-        self.change(sentences=said[-MOST_SENTENCES:])
+        sentences = [*self.run["sentences"], one_line(sentence, LONGEST_SENTENCE)]
+        self.change(sentences=sentences[-MOST_SENTENCES:])
 
     def step(self, step: BenchStep) -> None:
         """Send what is done from now on."""
@@ -89,14 +79,10 @@ class LinkReporter:
 
     def progress(self, now: BenchProgress) -> None:
         """Send how far the run is."""
-        curve = [one for one in self.run["curve"] if one[0] < now.pictures]
-        if math.isfinite(now.predicted_px):
-            curve.append([float(now.pictures), now.predicted_px])
-        seen = {name: {**self.run["cameras"][name], "cells": list(c)} for name, c in now.cells.items()}
-        fields = as_json(now)
-        del fields["placement"], fields["cells"]
-        cameras = {**self.run["cameras"], **seen}
-        self.change(state="running", step="pictures", curve=curve[-MOST_ON_CURVE:], cameras=cameras, **fields)
+        curve = [one for one in self.run["curve"] if one[0] < now["pictures"]]
+        if now["predicted_px"] is not None:
+            curve.append([float(now["pictures"]), now["predicted_px"]])
+        self.change(curve=curve[-MOST_ON_CURVE:], **now)
 
     def place(self, name: str, placement: Placement) -> None:
         """Request a placement, and wait until a client confirms that the board stands."""
@@ -105,14 +91,14 @@ class LinkReporter:
             self._stands.get()  # of a placement before
         described = {**as_json(placement), "description": str(placement), "needs_confirmation": by_hand}
         self.change(
-            asked={"name": name, **described},
+            requested={"name": name, **described},
             placements=self.run["placements"] + 1,
             step="place",
-            state="asking" if by_hand else "running",
+            state="waiting" if by_hand else "running",
         )
         if by_hand:
             self._stands.get()
-        self.change(state="running", step="search")
+        self.step("search")
 
     def done(self, document: Mapping[str, Any]) -> None:
         """Send the result; ``document`` is what the command prints with ``--json``."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import signal
 import sys
 from collections.abc import Iterator
@@ -18,11 +19,10 @@ from mastctl.cli.output import Answer, CommandError, WrongUse, check_file, check
 
 if TYPE_CHECKING:
     from calib.plan.placements import Placement
-    from mastctl.answers import BenchStep
-    from mastctl.bench.frame import RoverFrame
-    from mastctl.bench.reporter import BenchProgress, Reporter
+    from mastctl.answers import BenchProgress, BenchStep
     from mastctl.bench.result import BenchDone
-    from mastctl.bench.run import BenchRun
+    from mastctl.bench.run import BenchRun, Reporter
+    from mastctl.bench.survey import RoverFrame
     from mastctl.client import Client
 
 COMMAND = "calibrate bench"
@@ -98,9 +98,8 @@ def survey_folder(out: Path) -> Path:
 
 def _again(args: argparse.Namespace) -> Answer:
     from calib.survey.reader import read_survey
-    from mastctl.bench.folder import former_rig, moved_placements, read_notes
-    from mastctl.bench.frame import frame_of
     from mastctl.bench.result import fit_again
+    from mastctl.bench.survey import RoverFrame, former_rig, frame_of, moved_placements, read_notes
 
     survey = read_survey(args.folder)
     if not survey.boards:
@@ -111,7 +110,7 @@ def _again(args: argparse.Namespace) -> Answer:
         )
     notes = read_notes(args.folder)
     frame = _frame(args)
-    if not frame.stated:
+    if frame == RoverFrame():
         frame = frame_of(notes)
     if args.model is not None:
         survey = survey.as_model(args.model)
@@ -125,7 +124,7 @@ def _again(args: argparse.Namespace) -> Answer:
 def _frame(args: argparse.Namespace) -> RoverFrame:
     """What the rover frame hangs on, as far as it was stated."""
     from calib.files.mast_file import load_rig
-    from mastctl.bench.frame import RoverFrame
+    from mastctl.bench.survey import RoverFrame
 
     mast_at = args.mast_at
     if args.mast_like is not None:
@@ -138,11 +137,8 @@ def _drive(args: argparse.Namespace) -> Answer:
     from calib.calibrate.starts.bench import BenchNotFitted
     from calib.survey.writer import NotWritten
     from calib.targets.board_file import load_board
-    from mastctl.bench.looks import BoardLost
     from mastctl.bench.mast import BenchInterrupted
-    from mastctl.bench.reporter import NoOperator
     from mastctl.bench.result import finish
-    from mastctl.bench.search import BoardNotFound
 
     board = load_board(args.board)
     folder = args.survey or survey_folder(args.out)
@@ -150,7 +146,7 @@ def _drive(args: argparse.Namespace) -> Answer:
     try:
         with _bench(args, board, folder) as (bench, reporter):
             done = finish(bench, reporter, args.out, args.report)
-    except (BenchInterrupted, BoardNotFound, BoardLost, NoOperator) as reason:
+    except BenchInterrupted as reason:
         raise CommandError(reason.code, f"{reason}; {kept}") from None
     except (BenchNotFitted, NotWritten) as reason:
         error = output.as_command_error(reason)
@@ -171,11 +167,12 @@ def _answer(done: BenchDone, models: dict[str, Any], lines: list[str]) -> Answer
 class Terminal:
     """Shows a run line by line on stderr, and has an operator place the board; see `Reporter`.
 
-    ``by_hand``: whether the operator does; the board of a simulated bench goes by itself.
+    ``by_hand``: whether the operator does; the board of a simulated bench goes by itself. ``most``: pictures
+    of a camera.
     """
 
-    def __init__(self, by_hand: bool) -> None:
-        self._by_hand = by_hand
+    def __init__(self, by_hand: bool, most: int) -> None:
+        self._by_hand, self._most = by_hand, most
 
     def say(self, sentence: str) -> None:
         """Write a line."""
@@ -187,30 +184,45 @@ class Terminal:
 
     def progress(self, now: BenchProgress) -> None:
         """Write a line."""
-        self.say(now.sentence())
+        from mastctl.bench.result import px
+
+        seen = ", ".join(
+            f"{name} {100 * sum(map(bool, image['cells'])) / len(image['cells']):.0f} %"
+            for name, image in now["cameras"].items()
+        )
+        line = (
+            f"p{now['placements']}: {now['pictures']} of {self._most} pictures a camera; seen over {seen}; "
+            f"pointing to {px(now['predicted_px'])} (wanted {px(now['target_px'])})"
+        )
+        if now["next_rad"] is not None:
+            pan, tilt = (math.degrees(angle) for angle in now["next_rad"])
+            line += f"; most helps pan {pan:+.0f}, tilt {tilt:+.0f} degrees: to {px(now['expected_px'])}"
+        self.say(line)
 
     def place(self, name: str, placement: Placement) -> None:
-        """Request the placement, and wait for Enter. Raises NoOperator."""
-        from mastctl.bench.reporter import NoOperator
+        """Request the placement, and wait for Enter. Raises BenchInterrupted ``no_operator``."""
+        from mastctl.bench.mast import BenchInterrupted
 
         if not self._by_hand:
             self.say(f"placement {name}: the board {placement}")
             return
         if not signals.may_read_stdin():
-            raise NoOperator("no operator can place the board: the command runs in its terminal's background")
+            raise BenchInterrupted(
+                "no operator can place the board: the command runs in its terminal's background",
+                "no_operator",
+            )
         self.say(f"\nPlacement {name}: put the board {placement}.")
         sys.stderr.write("It need not be exact. Enter when it stands still (Ctrl-C: later). ")
         sys.stderr.flush()
         if not sys.stdin.readline():
-            raise NoOperator("no operator can place the board: standard input has ended")
+            raise BenchInterrupted("no operator can place the board: standard input has ended", "no_operator")
 
 
 @contextmanager
 def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple[BenchRun, Reporter]]:
     """A run on a daemon that runs, or on one that is started for it, under a lease."""
-    from mastctl.bench.looks import BenchGoal
     from mastctl.bench.mast import BenchInterrupted
-    from mastctl.bench.run import open_run
+    from mastctl.bench.run import BenchGoal, open_run
     from mastctl.client import ClientError
 
     with ExitStack() as stack:
@@ -226,7 +238,7 @@ def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple
                 raise WrongUse(f"--cameras names {name}; the daemon has {', '.join(served)}")
         if args.by_hand and not status["simulated"]:
             raise WrongUse("--by-hand is of a simulated bench, and this one is real")
-        reporter = Terminal(args.by_hand or not status["simulated"])
+        reporter = Terminal(args.by_hand or not status["simulated"], args.pictures)
         wanted = BenchGoal(args.wanted_px, args.pictures)
         yield (
             open_run(client, board, folder, reporter, wanted, args.cameras or served, _frame(args)),

@@ -23,7 +23,6 @@ from drivers.simulation_clock import SimulationClock
 from mastctl.answers import CalibrationTold, CameraTold, MeasuredJoints, Status, TrackTold
 from mastctl.as_json import as_json
 from mastctl.bench.operation import BenchOperation
-from mastctl.bench.reports import Reports
 from mastctl.config import Config
 from mastctl.control.audit import STRANGERS, STRANGERS_FILES, AuditLog
 from mastctl.control.entry import Answers, CommandEntry
@@ -131,7 +130,6 @@ class Service:
             publisher,
             hardware.kind == "simulated",
         )
-        self.reports = Reports(self.folder.path, self.bench.runs)
         self.sentinel = SentinelFindings(
             self.folder.path / SENTINEL_FOLDER, lambda: self.stored.digest, self.journals
         )

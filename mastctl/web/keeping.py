@@ -249,9 +249,8 @@ def add_bench(app: FastAPI) -> None:
 
     @app.get(f"{PREFIX}/reports", summary="The reports that can be read")
     async def listed(here: Here) -> ReportList:
-        reports = here.service.reports
-        found = await here.waiting.run(reports.summaries)
-        return {"reports": found, "folder": str(reports.folder)}
+        runs = here.service.bench.runs
+        return {"reports": await here.waiting.run(runs.reports), "folder": str(runs.reports_folder)}
 
     @app.get(
         f"{PREFIX}/reports/{{name}}",
@@ -260,7 +259,7 @@ def add_bench(app: FastAPI) -> None:
         responses=file_of("text/html"),
     )
     async def report(name: ReportName, here: Here) -> Response:
-        page = await here.waiting.run(lambda: here.service.reports.page(name))
+        page = await here.waiting.run(lambda: here.service.bench.runs.report(name))
         headers = {"Content-Security-Policy": REPORT, "Cross-Origin-Opener-Policy": "same-origin"}
         return Response(page, media_type="text/html; charset=utf-8", headers=headers)
 

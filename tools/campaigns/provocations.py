@@ -56,7 +56,7 @@ from calib.targets.board_file import document_of, save_board
 from calib.targets.boards import AnyBoard, AprilGrid, Charuco
 from drivers.interfaces import Image
 from hil_tests.support.sim_survey.plan import SurveyPlan, rover_from_head
-from mastctl.bench.simulated import BOARD
+from mastctl.bench.mast import BOARD
 from mastctl.calibration.run import SurveyRefused, checked_survey
 from mastctl.calibration.verdict import judge
 from mastctl.cli.main import main as mastctl

@@ -16,6 +16,7 @@ from calib.geometry.rigid import FloatArray, Rigid
 from calib.plan.placements import Placement
 from calib.targets.boards import AnyBoard, Corners
 from hil_tests.support.sim_survey.plan import rover_from_head
+from mastctl.answers import BenchProgress
 from mastctl.bench.mast import BenchHead, BenchLook, SeenBoard
 
 EDGE_PX = 3.0
@@ -83,7 +84,7 @@ class CornerBench:
     pictures: int = 0
 
     def stand(self, placement: Placement) -> None:
-        """Place the board where it was asked for, as exactly as a person does: the same each time."""
+        """Place the board where it is requested, as exactly as a person does: the same each time."""
         rng = np.random.default_rng(abs(hash(placement)))
         pose = placement.rover_from_board(self.true_rig.mast.rover_from_head(0.0, 0.0))
         pose = pose @ Rigid(_small_turn(rng.normal(0.0, 0.08, 3)), np.zeros(3))
@@ -115,18 +116,18 @@ class CornerBench:
         return 0 if axis.one_sided else axis.side
 
     def _seen(self, camera: str, true_rad: tuple[float, float]) -> SeenBoard:
-        held = self.true_rig.cameras[camera]
+        mounted = self.true_rig.cameras[camera]
         read = self.pan.read_rad, self.tilt.read_rad
         if self.rover_from_board is None:
             return SeenBoard(camera, *read, None, "no corners")
         pose = self.rover_from_board
-        if held.on == "head":
+        if mounted.on == "head":
             pose = rover_from_head(self.true_rig.mast, *true_rad).inverse @ pose
         points = pose.points(self.board.in_board_m(self.board.ids))
-        sight = points - held.model.C
+        sight = points - mounted.model.C
         facing = sight @ pose.rotation[:, 2] > FLATTEST * np.linalg.norm(sight, axis=1)
-        pixels, valid = held.model.project(points)
-        size = np.array(held.model.size_px)
+        pixels, valid = mounted.model.project(points)
+        size = np.array(mounted.model.size_px)
         inside = valid & facing & ((pixels > EDGE_PX) & (pixels < size - 1 - EDGE_PX)).all(axis=1)
         if inside.sum() < 6:
             return SeenBoard(camera, *read, None, "no corners")
@@ -140,22 +141,23 @@ class SelfPlacing:
     """Places the board of a `CornerBench` where it is requested, and keeps what is reported."""
 
     bench: CornerBench
-    told: list[str] = field(default_factory=list)
+    sentences: list[str] = field(default_factory=list)
+    shown: list[BenchProgress] = field(default_factory=list)
 
     def say(self, sentence: str) -> None:
         """Keep it."""
-        self.told.append(sentence)
+        self.sentences.append(sentence)
 
     def step(self, step: str) -> None:
         """Pass over it."""
 
-    def progress(self, now: object) -> None:
+    def progress(self, now: BenchProgress) -> None:
         """Keep it."""
-        self.told.append(now.sentence())  # type: ignore[attr-defined]
+        self.shown.append(now)
 
     def place(self, name: str, placement: Placement) -> None:
         """Put the board there."""
-        self.told.append(f"{name}: {placement}")
+        self.sentences.append(f"{name}: {placement}")
         self.bench.stand(placement)
 
 

@@ -1,4 +1,4 @@
-"""A bench of corners, with its folder and who places the board, for the tests of runs."""
+"""A bench of corners, with its folder and a person that places the board, for the tests of runs."""
 
 from __future__ import annotations
 
@@ -14,12 +14,9 @@ from calib.geometry.rig import Rig
 from calib.survey.records import Sigma
 from calib.targets.boards import Charuco
 from hil_tests.mastctl.bench.bench_of_corners import CornerBench, SelfPlacing, TrueAxis
-from mastctl.bench.folder import RunFolder
-from mastctl.bench.frame import RoverFrame, fit_in_rover
-from mastctl.bench.looks import BenchGoal
 from mastctl.bench.mast import BenchHead, BenchMast
-from mastctl.bench.reporter import Reporter
-from mastctl.bench.run import BenchRun
+from mastctl.bench.run import BenchGoal, BenchRun, Reporter
+from mastctl.bench.survey import RunFolder
 
 BOARD = Charuco(10, 7, 0.055, 0.042)
 PAIR = ("navcam_left", "navcam_right")
@@ -70,9 +67,8 @@ def run_of(
     mast: BenchMast | None = None,
     reporter: Reporter | None = None,
 ) -> tuple[BenchRun, SelfPlacing]:
-    """A run, and who places the board for it; ``mast`` and ``reporter`` instead of the bench's own."""
+    """A run, and the person that places its board; ``mast`` and ``reporter`` instead of the bench's own."""
     person = SelfPlacing(bench)
     kept = kept_in(folder, bench)
-    fit = fit_in_rover(RoverFrame(), bench.head.rig, kept.moved)
-    run = BenchRun(mast or bench, kept, BOARD, reporter or person, fit, wanted or BenchGoal())
+    run = BenchRun(mast or bench, kept, BOARD, reporter or person, wanted or BenchGoal())
     return run, person

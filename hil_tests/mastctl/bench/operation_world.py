@@ -26,11 +26,11 @@ BEGUN = {
     "cameras": {"navcam_left": {"size_px": [1024, 768], "cells": [0] * 48}},
 }
 PLACE = {
-    "asked": {
+    "requested": {
         "name": "p1", "range_m": 1.1, "bearing_deg": 0.0, "height_deg": 0.0, "turned_deg": [20.0, 0.0],
         "description": "straight ahead", "needs_confirmation": True,
     },
-    "placements": 1, "step": "place", "state": "asking",
+    "placements": 1, "step": "place", "state": "waiting",
 }  # fmt: skip
 PROGRESS = {
     "state": "running", "step": "pictures", "pictures": 3, "predicted_px": 6.2, "target_px": 0.2,

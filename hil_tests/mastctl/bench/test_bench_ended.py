@@ -1,4 +1,4 @@
-"""What ends a driven bench before its end is told in a sentence, with where all of it is kept."""
+"""What ends a driven bench before its end is a sentence, with where all of it is kept."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ from hil_tests.mastctl.bench.bench_of_corners import CornerBench
 from hil_tests.mastctl.bench.bench_world import corner_bench, run_of
 from hil_tests.mastctl.outside_daemon import write_config
 from hil_tests.mastctl.service_fakes import FakeHardware
-from mastctl.bench.folder import looks_of
 from mastctl.bench.mast import BenchInterrupted, BenchLook, NoLight
 from mastctl.bench.run import BenchRun
-from mastctl.bench.search import BoardNotFound, find_board
+from mastctl.bench.search import find_board
+from mastctl.bench.survey import looks_of
 from mastctl.cli import calibrate_bench
 from mastctl.cli.main import main
 from mastctl.daemon import RunningDaemon
@@ -124,7 +124,7 @@ def test_a_full_disk_leaves_a_whole_folder_that_a_later_run_goes_on_with(
     with pytest.raises(StopIteration):
         again.run()
     after = [look for _, _, look in looks_of(read_survey(tmp_path / "bench"))]
-    assert any("stands as it stood" in line for line in second.told)
+    assert any("stands as it stood" in line for line in second.sentences)
     assert len(after) > len(before)
 
 
@@ -154,8 +154,8 @@ def test_a_search_that_finds_another_board_ends_soon_and_says_why(
     repository: Path, tmp_path: Path, why: str
 ) -> None:
     bench = corner_bench(repository)
-    run, teller = run_of(bench, tmp_path / "bench")
-    teller.place = lambda *_: None  # type: ignore[method-assign]  # what stands there is none of ours
+    run, person = run_of(bench, tmp_path / "bench")
+    person.place = lambda *_: None  # type: ignore[method-assign]  # what stands there is none of ours
     looked = bench.look
 
     def look(*at: Any) -> BenchLook:
@@ -164,7 +164,7 @@ def test_a_search_that_finds_another_board_ends_soon_and_says_why(
         return BenchLook(seen, 0, 0, 1.0)
 
     bench.look = look  # type: ignore[assignment, method-assign]
-    with pytest.raises(BoardNotFound, match=re.escape(why)):
+    with pytest.raises(BenchInterrupted, match=re.escape(why)):
         run.run()
     assert bench.looks <= 12
 
@@ -198,9 +198,9 @@ def test_dark_or_blurred_views_do_not_end_a_search_before_the_board(
     repository: Path, tmp_path: Path, why: str
 ) -> None:
     bench = corner_bench(repository)
-    run, teller = run_of(bench, tmp_path / "bench")
+    run, person = run_of(bench, tmp_path / "bench")
     in_the_night(bench, [why])
-    asked = Placement(2.0, 0.0, 0.0, (0.0, 0.0))
-    bench.stand(replace(asked, bearing_deg=math.degrees(ASIDE_RAD)))
-    look = find_board(bench, run.known.now, run.known.sought, teller, asked)
+    requested = Placement(2.0, 0.0, 0.0, (0.0, 0.0))
+    bench.stand(replace(requested, bearing_deg=math.degrees(ASIDE_RAD)))
+    look = find_board(bench, run.known.now, run.known.sought, person.say, requested)
     assert look.found and bench.looks > 24

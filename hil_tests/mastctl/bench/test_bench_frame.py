@@ -20,9 +20,9 @@ from calib.survey.reader import read_survey
 from calib.survey.records import Survey
 from calib.survey.writer import write_survey
 from hil_tests.support.sim_survey.bench import NAVCAMS, BenchCamera, BenchPlan, Placement, simulate_bench
-from mastctl.bench import frame
-from mastctl.bench.folder import FORMER
-from mastctl.bench.frame import RoverFrame, fit_in_rover
+from mastctl.bench import survey as bench_survey
+from mastctl.bench.known import corner_noise
+from mastctl.bench.survey import FORMER, RoverFrame, fit_in_frame
 from mastctl.calibration.verdict import judge
 from mastctl.cli.main import main
 
@@ -122,17 +122,17 @@ def test_a_placement_that_moved_is_left_out_with_a_sentence(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     survey = read_survey(folder)
-    whole = frame.fit_bench  # type: ignore[attr-defined]
+    whole = bench_survey.fit_bench  # type: ignore[attr-defined]
 
     def fits_only_without_p1(survey: Survey) -> BenchCalibration:
         if any(image.placement == "p1" for image in survey.images):
             raise BenchNotFitted("the fit leaves 24.6 times the stated noise of a corner")
         return whole(survey)
 
-    monkeypatch.setattr(frame, "fit_bench", fits_only_without_p1)
+    monkeypatch.setattr(bench_survey, "fit_bench", fits_only_without_p1)
     with pytest.raises(BenchNotFitted, match=r"24\.6 times"):
-        frame.fit_in_frame(survey, frame.RoverFrame(), None)
-    done = frame.fit_in_frame(survey, frame.RoverFrame(), None, moved={"p1": 24.7})
+        fit_in_frame(survey, RoverFrame(), None)
+    done = fit_in_frame(survey, RoverFrame(), None, moved={"p1": 24.7})
     assert {placement for _, placement in done.rover_from_board} == {"p2", "p3"}
     (reason,) = [r for r in judge(survey, done).reasons if "placement p1" in r.sentence]
     assert reason.grade == "care" and "shows the board 24.7 px aside" in reason.sentence
@@ -144,6 +144,5 @@ EXACT = pytest.mark.long(1, "the case of an exact print; an inexact one is in th
 @pytest.mark.parametrize("print_m", [pytest.param(0.0, marks=EXACT), 1e-4])
 def test_a_run_plans_with_corners_that_are_off_by_what_print_and_lens_add(print_m: float) -> None:
     survey = simulate_bench(1, BenchPlan(attitudes=9, checks=3, own_px=0.01, print_m=print_m))
-    former = fit_bench(survey).rig
-    fitted = fit_in_rover(RoverFrame(), former, dict)(survey)
-    assert fitted.sigma_scale * 0.01 == pytest.approx(fitted.corner_rms_px, rel=0.4)
+    rms_px, scale = corner_noise(fit_bench(survey), survey)
+    assert scale * 0.01 == pytest.approx(rms_px, rel=0.4)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -40,16 +39,13 @@ def gone(pid: int | None) -> bool:
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
 
 
-def stop_pressed(command: str = "stop") -> dict[str, Any]:
-    return {"number": 1, "command": command, "who": "Bo", "result": "ok"}
-
-
 def test_a_run_is_followed_over_a_placement_to_its_verdict(tmp_path: Path) -> None:
     with world(tmp_path, script(BEGUN, PLACE, answered, PROGRESS, writes_files, DONE)) as made:
         begun = made.begin(wanted_px=0.5)
         assert (begun["state"], begun["by"], begun["wanted_px"]) == ("running", "Ana", 0.5)
-        asked = made.until("asking")["asked"]
-        assert asked is not None and asked["turned_deg"] == [20.0, 0.0] and asked["needs_confirmation"]
+        requested = made.until("waiting")["requested"]
+        assert requested is not None and requested["turned_deg"] == [20.0, 0.0]
+        assert requested["needs_confirmation"]
         assert made.leases.control().holder == "bench calibration"  # type: ignore[union-attr]
         made.bench.stands()
         run = made.until("done")
@@ -67,7 +63,7 @@ def test_a_run_is_followed_over_a_placement_to_its_verdict(tmp_path: Path) -> No
 def test_the_worker_gets_lease_and_token_but_not_on_its_command_line(tmp_path: Path) -> None:
     with world(tmp_path, script(BEGUN, says_lease_and_token, PLACE, answered)) as made:
         made.begin()
-        (said,) = made.until("asking")["sentences"]
+        (said,) = made.until("waiting")["sentences"]
         token, lease_id = said.split()
         assert token == "secret-of-the-worker" and made.leases.holds(lease_id)
         shown = Path(f"/proc/{made.bench.pid}/cmdline").read_bytes().decode()
@@ -95,22 +91,20 @@ def test_a_stop_ends_the_run_and_takes_its_right_to_steer_at_once(tmp_path: Path
         lease_id = run["sentences"][0].split()[1]
         with made.leases.steering(BO, lease_id):
             pass
-        made.leases.stop_came()
-        with pytest.raises(NotNow, match="the head was stopped"), made.leases.steering(BO, lease_id):
+        made.leases.stop_came("the head was stopped by Bo")
+        with pytest.raises(NotNow, match="the head was stopped by Bo"), made.leases.steering(BO, lease_id):
             pass
-        made.publisher.publish("command", "1", stop_pressed() | {"result": "no_reply"})
         run = made.until("interrupted")
         assert run["code"] == "stopped" and gone(pid) and made.leases.control() is None
-        assert run["sentence"].startswith("Bo pressed stop; the head did not confirm it")
+        assert run["sentence"].startswith("the head was stopped by Bo; everything seen is kept")
 
 
 def test_a_stop_while_the_board_is_placed_ends_the_run_too(tmp_path: Path) -> None:
     with world(tmp_path, script(BEGUN, PLACE, answered)) as made:
         made.begin()
-        made.until("asking")
-        made.leases.stop_came()
-        made.publisher.publish("command", "1", stop_pressed("estop"))
-        assert "the emergency stop; the head stands still" in made.until("interrupted")["sentence"]
+        made.until("waiting")
+        made.leases.stop_came("the head was stopped by Bo")
+        assert made.until("interrupted")["code"] == "stopped"
         with pytest.raises(NotNow, match="no bench calibration is at work"):
             made.bench.stands()
 
@@ -146,7 +140,7 @@ def test_a_client_that_takes_over_ends_the_run(tmp_path: Path) -> None:
 def test_a_run_that_is_left_goes_on_from_its_folder(tmp_path: Path) -> None:
     with world(tmp_path, script(BEGUN, says_folder, PLACE, answered)) as made:
         first = made.begin(pictures=33, by_hand=True)
-        run = made.until("asking")
+        run = made.until("waiting")
         with made.leases.steering(BO, made.lease_id):
             made.stops.running = "000004"
         left = made.bench.leave("Bo")
@@ -156,14 +150,14 @@ def test_a_run_that_is_left_goes_on_from_its_folder(tmp_path: Path) -> None:
         assert (listed["name"], listed["state"]) == (first["name"], "interrupted")
         again = made.begin(board=None, resume=first["name"])
         assert (again["name"], again["most"], again["by_hand"]) == (first["name"], 33, True)
-        assert run["sentences"] == made.until("asking")["sentences"] == [first["name"]]
+        assert run["sentences"] == made.until("waiting")["sentences"] == [first["name"]]
         assert made.bench.answer()["runs"][0]["state"] == "running"
 
 
 def test_a_run_that_was_cut_off_with_its_daemon_is_listed_and_goes_on(tmp_path: Path) -> None:
     with world(tmp_path, script(BEGUN, PLACE, answered)) as made:
         name = made.begin()["name"]
-        made.until("asking")
+        made.until("waiting")
     file = tmp_path / "state" / "bench" / name / "run.json"
     document = json.loads(file.read_text())
     assert "the daemon ended" in document.pop("end")["sentence"]

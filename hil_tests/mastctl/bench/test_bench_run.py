@@ -17,16 +17,15 @@ from calib.plan.placements import Placement
 from calib.survey.reader import read_survey
 from hil_tests.mastctl.bench.bench_of_corners import CornerBench
 from hil_tests.mastctl.bench.bench_world import corner_bench, run_of
-from mastctl.bench.folder import looks_of
-from mastctl.bench.looks import BoardLost
-from mastctl.bench.mast import BenchLook
+from mastctl.bench.mast import BenchInterrupted, BenchLook
+from mastctl.bench.survey import looks_of
 
 
 def test_a_bench_ends_by_itself_with_what_was_wanted_met_on_paper_and_kept(
     repository: Path, tmp_path: Path
 ) -> None:
     bench = corner_bench(repository)
-    run, teller = run_of(bench, tmp_path / "bench")
+    run, person = run_of(bench, tmp_path / "bench")
     fitted = run.run()
     assert run.known.predicted_px() <= 0.2 and run.known.pictures() <= 60 and bench.seconds < 240.0
     survey = read_survey(tmp_path / "bench")
@@ -41,7 +40,7 @@ def test_a_bench_ends_by_itself_with_what_was_wanted_met_on_paper_and_kept(
     assert any(check for _, check, _ in looks_of(read_survey(tmp_path / "bench")))
     for name, true in bench.true_rig.cameras.items():
         np.testing.assert_allclose(fitted.rig.cameras[name].model.H, true.model.H, atol=8.0)
-    assert any("p2" in line for line in teller.told)
+    assert any("p2" in line for line in person.sentences)
 
 
 def whole_rover(repository: Path) -> tuple[Rig, Rig]:
@@ -54,18 +53,18 @@ def whole_rover(repository: Path) -> tuple[Rig, Rig]:
 def test_a_camera_that_can_show_nothing_new_takes_no_picture(repository: Path, tmp_path: Path) -> None:
     bench = corner_bench(repository, of=whole_rover)
     run, _ = run_of(bench, tmp_path / "bench")
-    known, looks, every = run.known, run._looks, tuple(bench.head.rig.cameras)
+    known, every = run.known, tuple(bench.head.rig.cameras)
     bench.stand(Placement(1.3, 0.0, -35.0, (10.0, 0.0)))
     known.take("p1", bench.look(0.0, -0.6))
     beside, at_it = BenchShot("p1", 0.7, -0.6, ()), BenchShot("p1", 0.0, -0.6, ())
     navcams, pancams = ({name for name in every if kind in name} for kind in ("nav", "pan"))
     for shot in (at_it, beside, at_it):
-        look = looks.look_at(shot)
+        look = run.look_at(shot)
         assert look is not None and {"hazcam_left", *navcams} <= set(look.cameras)
         known.take("p1", look)
-    assert set(looks.look_at(at_it).cameras) == navcams | pancams, "hazcams stand still before it"
+    assert set(run.look_at(at_it).cameras) == navcams | pancams, "hazcams stand still before it"
     for shot in known.round_others("p1"):
-        look = looks.look_at(shot)
+        look = run.look_at(shot)
         assert look is not None
         known.take("p1", look)
     for pancam in pancams:
@@ -74,8 +73,8 @@ def test_a_camera_that_can_show_nothing_new_takes_no_picture(repository: Path, t
     assert not list(known.round_others("p1"))
     known.end()
     known.fitted = object()  # type: ignore[assignment]  # the estimate is good now
-    assert set(looks.look_at(beside).cameras) == navcams, "it is beside the narrow view"
-    assert set(looks.look_at(at_it, check=True).cameras) == set(every), "a check is of each of them"
+    assert set(run.look_at(beside).cameras) == navcams, "it is beside the narrow view"
+    assert set(run.look_at(at_it, check=True).cameras) == set(every), "a check is of each of them"
 
 
 class Dying(RuntimeError):
@@ -95,7 +94,7 @@ class Mortal:
         return self.bench.look(*at)
 
 
-def test_a_run_that_died_goes_on_at_its_placement_without_asking(repository: Path, tmp_path: Path) -> None:
+def test_a_run_that_died_goes_on_at_its_placement_without_a_request(repository: Path, tmp_path: Path) -> None:
     bench = corner_bench(repository, seed=2)
     run, _ = run_of(bench, tmp_path / "bench", mast=Mortal(bench, 5))  # dies in the first placement
     with pytest.raises(Dying):
@@ -108,8 +107,9 @@ def test_a_run_that_died_goes_on_at_its_placement_without_asking(repository: Pat
     after = list(looks_of(read_survey(tmp_path / "bench")))
     assert len(before) == 5 and [p for p, _, _ in after][:5] == [p for p, _, _ in before]
     assert len(after) > 5 and after[5][0] == before[4][0], "it goes on at the same placement"
-    assert any("stands as it stood" in line for line in second.told)
-    assert not any(line.startswith("p1: straight ahead") for line in second.told)
+    assert any("stands as it stood" in line for line in second.sentences)
+    assert not any(line.startswith("p1: straight ahead") for line in second.sentences)
+    assert second.shown[0]["placements"] == 1 and second.shown[0]["pictures"] == len(before)
 
 
 def test_a_board_that_is_taken_away_ends_the_run_and_loses_nothing(repository: Path, tmp_path: Path) -> None:
@@ -126,7 +126,7 @@ def test_a_board_that_is_taken_away_ends_the_run_and_loses_nothing(repository: P
         return looked(pan_rad, tilt_rad, approach)
 
     bench.look = look  # type: ignore[assignment, method-assign]
-    with pytest.raises(BoardLost, match="Put it back or place it anew"):
+    with pytest.raises(BenchInterrupted, match="Put it back or place it anew"):
         run.run()
     assert len(list(looks_of(read_survey(tmp_path / "bench")))) == 5
 

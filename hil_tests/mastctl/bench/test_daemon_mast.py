@@ -13,11 +13,9 @@ from calib.geometry.mode import SensorMode
 from calib.geometry.rig import AxisJoint, JointErrors
 from calib.plan.placements import Placement
 from calib.targets.boards import Charuco
-from mastctl.bench import daemon_mast
-from mastctl.bench.daemon_mast import DaemonMast
-from mastctl.bench.folder import survey_cameras
-from mastctl.bench.mast import BenchInterrupted, NoLight, NotThere
-from mastctl.bench.simulated import SimulatedBoard
+from mastctl.bench import mast as bench_mast
+from mastctl.bench.mast import BenchInterrupted, DaemonMast, NoLight, NotThere, SimulatedBoard
+from mastctl.bench.survey import survey_cameras
 from mastctl.client import Client
 from mastctl.config import Config, Listen, load_config
 from mastctl.daemon import RunningDaemon
@@ -42,8 +40,8 @@ def client(repository: Path) -> Iterator[Client]:
 
 @pytest.fixture
 def mast(client: Client, monkeypatch: pytest.MonkeyPatch) -> Iterator[DaemonMast]:
-    monkeypatch.setattr(daemon_mast, "PATIENCE_S", 0.2)
-    monkeypatch.setattr(daemon_mast, "AGAIN_S", 0.05)
+    monkeypatch.setattr(bench_mast, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(bench_mast, "AGAIN_S", 0.05)
     mast = DaemonMast(client, CAMERAS, BOARD)
     SimulatedBoard(client, BOARD, mast.head.rig).stand(Placement(1.2, 0.0, 0.0, (15.0, 0.0)))
     yield mast

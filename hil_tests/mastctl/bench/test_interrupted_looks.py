@@ -17,9 +17,8 @@ import pytest
 from calib.targets.boards import Charuco
 from hil_tests import forks
 from hil_tests.waiting import until
-from mastctl.bench import daemon_mast
-from mastctl.bench.daemon_mast import DaemonMast, beside_goal
-from mastctl.bench.mast import BenchInterrupted
+from mastctl.bench import mast as bench_mast
+from mastctl.bench.mast import BenchInterrupted, DaemonMast, beside_goal
 from mastctl.client import Client
 
 BOARD = Charuco(10, 7, 0.055, 0.042)
@@ -58,8 +57,8 @@ def url(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(daemon_mast, "PATIENCE_S", 0.2)
-    monkeypatch.setattr(daemon_mast, "AGAIN_S", 0.05)
+    monkeypatch.setattr(bench_mast, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(bench_mast, "AGAIN_S", 0.05)
 
 
 def in_the_move(url: str, act: Callable[[Client], object]) -> threading.Thread:
@@ -132,7 +131,7 @@ def test_a_stop_between_two_moves_ends_it_and_is_told(url: str) -> None:
 
 
 def test_a_move_that_outlasts_its_time_is_stopped(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(daemon_mast, "TURN_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(bench_mast, "TURN_TIMEOUT_S", 0.5)
     with Client(url, name="bench") as client, client.lease(name="calibrate bench"):
         mast = DaemonMast(client, ("navcam_left",), BOARD)
         with pytest.raises(BenchInterrupted, match=r"did not end in the 0\.5 s"):

@@ -33,9 +33,9 @@ from tools.page_tables import page_text
 KINDS = (BadRequest, NotAllowed, NotKnown, NotLetIn, NoLonger, NotNow, Unable)
 FAMILIES = {kind.__name__: kind for kind in KINDS}
 NO_ANSWER = {
-    "survey_refused", "cannot_tell", "no_operator", "address_in_use", "state_in_use",
+    "survey_refused", "cannot_tell", "address_in_use", "state_in_use",
     "token_refused", "no_executor", "task_failed", "other_program", "bad_rig", "in_the_way",
-    "not_there", "board_not_found", "board_lost", "look_ended",
+    "not_there", "look_ended",
     "report_not_written", "no_such_frame",
 }  # fmt: skip
 """Of commands that ask no daemon."""

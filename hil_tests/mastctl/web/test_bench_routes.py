@@ -103,7 +103,7 @@ def test_a_bench_run_takes_the_lease_of_the_client_that_begins_it(
         refused("leased", partial(client.begin_bench, "charuco_a3"))
     for event in bo.events("bench"):
         value: Any = event["value"]
-        if value["state"] == "asking":
+        if value["state"] == "waiting":
             break
     assert any(call[0] == "move" for call in hardware.head.calls), "the program steered"
     assert bo.board_stands()["name"] == run["name"]
@@ -190,7 +190,7 @@ def test_a_bench_program_has_a_token_that_ends_with_it(
             assert net.ask("POST", path, "view", json={}).status_code == 403
         assert net.ask("POST", "/bench", "operate", json={"board": "charuco_a4"}).status_code == 202
         bench = net.daemon.service.bench
-        until(lambda: bench.run and bench.run["state"] == "asking", "it came in")
+        until(lambda: bench.run and bench.run["state"] == "waiting", "it came in")
         assert bench.run is not None
         name, role, token = json.loads(bench.run["sentences"][0])
         assert (name, role) == ("bench calibration/bench calibration", "operate")
@@ -210,7 +210,7 @@ PAGE = "<!doctype html><title>Pointing &amp; more</title><style>p{color:red}</st
 
 @pytest.fixture(scope="module")
 def shelf(standing: Pair) -> Path:
-    folder = standing[0].service.reports.folder
+    folder = standing[0].service.bench.runs.reports_folder
     (folder / "arm").mkdir(parents=True)
     (folder / "pointing.html").write_text(PAGE)
     (folder / "arm" / "approach.html").write_text("no title")

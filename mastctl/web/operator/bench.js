@@ -32,7 +32,7 @@ export class Bench {
     this.leave = button("End it for now", () => this.act(() => post("/bench/leave", {})));
     this.goOn = button("Go on", () => this.begin({ resume: this.run.name }), "go");
     this.fresh = button("Begin another …", () => { this.closed = this.run?.name; this.anew.open = true; this.draw(); });
-    this.asked = h("div", { class: "bench-place" }, h("h3", {}, "Where the board goes"), this.words, this.where, this.stands);
+    this.place = h("div", { class: "bench-place" }, h("h3", {}, "Where the board goes"), this.words, this.where, this.stands);
     this.seen = h("div", { class: "coverages" });
     this.cover = h("div", {}, h("h3", {}, "Seen so far"), this.seen);
     this.plot = h("div");
@@ -42,7 +42,7 @@ export class Bench {
     this.verdict = h("div", { class: "bench-verdict" });
     this.log = h("ul", { class: "bench-log", "aria-label": "What it said last" });
     this.next = h("p", { class: "bench-next" });
-    this.now = h("div", { class: "bench-now" }, this.steps, this.verdict, this.next, h("div", { class: "buttons" }, this.goOn, this.fresh), h("div", { class: "bench-parts" }, this.asked, h("div", { class: "bench-side" }, this.cover, this.error)), this.log, h("div", { class: "buttons" }, this.leave));
+    this.now = h("div", { class: "bench-now" }, this.steps, this.verdict, this.next, h("div", { class: "buttons" }, this.goOn, this.fresh), h("div", { class: "bench-parts" }, this.place, h("div", { class: "bench-side" }, this.cover, this.error)), this.log, h("div", { class: "buttons" }, this.leave));
     this.said = h("p", { class: "bad", role: "alert" });
     this.buildForm();
     this.others = h("details", { class: "bench-runs" }, h("summary", {}, "Earlier runs"), h("table", { class: "figures list" }));
@@ -88,8 +88,8 @@ export class Bench {
   update(run) {
     const before = this.run;
     this.run = run;
-    if (run.name !== before?.name || run.state !== before.state || run.asked?.name !== before.asked?.name) {
-      if (run.state === "asking") this.speak(`Put the board ${run.asked.description}. Then press It stands.`);
+    if (run.name !== before?.name || run.state !== before.state || run.requested?.name !== before.requested?.name) {
+      if (run.state === "waiting") this.speak(`Put the board ${run.requested.description}. Then press It stands.`);
       else if (run.state === "done") this.speak(`Bench calibration: ${run.sentence}.`);
       else if (run.state === "interrupted") this.speak(`Bench calibration interrupted: ${run.sentence}.`, run.code !== "left");
       if (["done", "interrupted"].includes(run.state)) this.look();
@@ -169,18 +169,18 @@ export class Bench {
   }
 
   drawPlace(run) {
-    const { asked } = run;
-    const asking = run.state === "asking";
-    this.asked.dataset.asking = asking;
-    this.asked.hidden = run.step === "over" || (!asked && run.step !== "begin");
-    this.stands.hidden = !asking;
+    const { requested } = run;
+    const waiting = run.state === "waiting";
+    this.place.dataset.waiting = waiting;
+    this.place.hidden = run.step === "over" || (!requested && run.step !== "begin");
+    this.stands.hidden = !waiting;
     this.stands.disabled = !this.may || this.busy;
-    say(this.words, !asked ? "The calibration program starts …" : `${asking ? `Placement ${asked.name}: put the board ` : `Placement ${asked.name}: `}${asked.description}.${asking ? " It need not be exact. Lean it against something that does not move." : ""}`);
-    const key = asked && JSON.stringify([asked, run.board_m]);
+    say(this.words, !requested ? "The calibration program starts …" : `${waiting ? `Placement ${requested.name}: put the board ` : `Placement ${requested.name}: `}${requested.description}.${waiting ? " It need not be exact. Lean it against something that does not move." : ""}`);
+    const key = requested && JSON.stringify([requested, run.board_m]);
     if (key === this.sketched) return;
     this.sketched = key;
     const size = run.board_m ?? [0.5, 0.35];
-    put(this.where, asked ? [h("figure", {}, fromAbove(asked, size), h("figcaption", {}, "From above")), h("figure", {}, asSeen(asked, size), h("figcaption", {}, "As the head sees it, pan 0, tilt 0"))] : []);
+    put(this.where, requested ? [h("figure", {}, fromAbove(requested, size), h("figcaption", {}, "From above")), h("figure", {}, asSeen(requested, size), h("figcaption", {}, "As the head sees it, pan 0, tilt 0"))] : []);
   }
 
   drawError(run) {

@@ -8,31 +8,31 @@ const point = (x, y) => `${x.toFixed(2)} ${y.toFixed(2)}`;
 const shape = (points) => `M${points.map(([x, y]) => point(x, y)).join("L")}Z`;
 
 /** The four corners of a board in the frame of the head at zero, metres: forward, right, down. */
-export function boardCorners(asked, [width, height]) {
-  const [bearing, up] = [rad(asked.bearing_deg), rad(asked.height_deg)];
-  const [yaw, pitch] = [bearing - rad(asked.turned_deg[0]), up - rad(asked.turned_deg[1])];
-  const middle = [Math.cos(up) * Math.cos(bearing), Math.cos(up) * Math.sin(bearing), -Math.sin(up)].map((one) => one * asked.range_m);
+export function boardCorners(requested, [width, height]) {
+  const [bearing, up] = [rad(requested.bearing_deg), rad(requested.height_deg)];
+  const [yaw, pitch] = [bearing - rad(requested.turned_deg[0]), up - rad(requested.turned_deg[1])];
+  const middle = [Math.cos(up) * Math.cos(bearing), Math.cos(up) * Math.sin(bearing), -Math.sin(up)].map((one) => one * requested.range_m);
   const right = [-Math.sin(yaw), Math.cos(yaw), 0];
   const down = [Math.sin(pitch) * Math.cos(yaw), Math.sin(pitch) * Math.sin(yaw), Math.cos(pitch)];
   return [[-1, -1], [1, -1], [1, 1], [-1, 1]].map(([a, b]) => middle.map((one, k) => one + (a * width * right[k]) / 2 + (b * height * down[k]) / 2));
 }
 
 /** From above, ahead upwards: the head, arcs of range, the board with the side that it shows. */
-export function fromAbove(asked, size) {
+export function fromAbove(requested, size) {
   const [width, height, base] = [260, 210, 188];
-  const corners = boardCorners(asked, size);
-  const up = Math.max(0.6, asked.range_m * Math.cos(rad(asked.bearing_deg)), ...corners.map(([x]) => x)) + 0.15;
+  const corners = boardCorners(requested, size);
+  const up = Math.max(0.6, requested.range_m * Math.cos(rad(requested.bearing_deg)), ...corners.map(([x]) => x)) + 0.15;
   const aside = Math.max(0.6, ...corners.map(([, y]) => Math.abs(y))) + 0.25;
   const scale = Math.min((base - 14) / up, (width / 2 - 8) / aside);
   const at = ([x, y]) => [width / 2 + y * scale, base - x * scale];
-  const step = asked.range_m > 1.6 ? 1 : 0.5;
+  const step = requested.range_m > 1.6 ? 1 : 0.5;
   const arcs = Array.from({ length: Math.ceil((up + 0.3) / step) }, (_, k) => (k + 1) * step);
   const middle = [0, 1, 2].map((k) => corners.reduce((sum, one) => sum + one[k], 0) / 4);
   const edges = [[0, 3], [1, 2]].map(([a, b]) => [0, 1].map((k) => (corners[a][k] + corners[b][k]) / 2));
-  const face = rad(asked.bearing_deg - asked.turned_deg[0]);
+  const face = rad(requested.bearing_deg - requested.turned_deg[0]);
   const towards = [middle[0] - 0.22 * Math.cos(face), middle[1] - 0.22 * Math.sin(face)];
   const [bx, by] = at(middle);
-  return s("svg", { class: "sketch", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `From above: the board ${asked.description}` },
+  return s("svg", { class: "sketch", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `From above: the board ${requested.description}` },
     arcs.map((r) => s("circle", { class: "arc", cx: width / 2, cy: base, r: r * scale })),
     arcs.filter((r) => r * scale < base - 8).map((r) => s("text", { class: "tickname end", x: width / 2 - 0.6 * r * scale - 3, y: base - 0.8 * r * scale }, `${number(r, step < 1 ? 1 : 0)} m`)),
     s("path", { class: "sight", d: `M${point(width / 2, base)}L${point(bx, by)}` }),
@@ -43,14 +43,14 @@ export function fromAbove(asked, size) {
 }
 
 /** As the head at zero sees it: 120 by 80 degrees, the board as it would look. */
-export function asSeen(asked, size) {
+export function asSeen(requested, size) {
   const [width, height] = [260, 190];
   const at = ([x, y, z]) => [width / 2 + ((Math.atan2(y, x) * 180) / Math.PI) * (width / 120), height / 2 + ((Math.atan2(z, Math.hypot(x, y)) * 180) / Math.PI) * (height / 88)];
-  const corners = boardCorners(asked, size);
+  const corners = boardCorners(requested, size);
   const part = (u, v) => corners[0].map((one, k) => one + u * (corners[1][k] - one) + v * (corners[3][k] - one));
   const fields = [];
   for (let row = 0; row < 4; row += 1) for (let column = row % 2; column < 6; column += 2) fields.push(shape([[column, row], [column + 1, row], [column + 1, row + 1], [column, row + 1]].map(([u, v]) => at(part(u / 6, v / 4)))));
-  return s("svg", { class: "sketch", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `As the head sees it from pan 0, tilt 0: the board ${asked.description}` },
+  return s("svg", { class: "sketch", viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `As the head sees it from pan 0, tilt 0: the board ${requested.description}` },
     s("rect", { class: "field", x: 0.5, y: 0.5, width: width - 1, height: height - 1 }),
     s("path", { class: "zero", d: `M0 ${height / 2}H${width}M${width / 2} 0V${height}` }),
     s("path", { class: "paper", d: shape(corners.map(at)) }),

@@ -63,7 +63,7 @@ def test_stop_ends_it_says_so_and_it_goes_on_from_there(pair: BOTH, visit: Visit
     pid = bench.pid
     assert pid is not None
     one.page.locator("#bench").press("Escape")
-    one.page.wait_for_selector(".bench-verdict:has-text('pressed stop; the head stands still')")
+    one.page.wait_for_selector(".bench-verdict:has-text('the head was stopped by')")
     assert any(call[0] == "stop" for call in hardware.head.calls)
     with pytest.raises(ProcessLookupError):
         os.kill(pid, 0)
@@ -71,7 +71,7 @@ def test_stop_ends_it_says_so_and_it_goes_on_from_there(pair: BOTH, visit: Visit
     next_words = one.page.locator(".bench-next").inner_text()
     assert f"are kept in {kept.path}: 3 pictures a camera" in next_words
     assert "Go on continues" in next_words and "Begin another starts anew" in next_words
-    assert not one.page.locator(".bench-place").is_visible(), "no board is asked for"
+    assert not one.page.locator(".bench-place").is_visible(), "no board is requested"
     assert not one.page.locator(".bench-steps").is_visible(), "no step is ticked that was not taken"
     bench.work = script(BEGUN, writes_files, DONE)
     one.page.click("#bench button:has-text('Go on')")

@@ -1,0 +1,370 @@
+"""A run's survey: its folder with all that was seen and a journal, and the fit in the rover frame.
+
+No board of unknown place shows where the rover frame is: the mast stays where the former mast file has it,
+unless a `RoverFrame` states something else.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import weakref
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calib.adjust.result import BenchCalibration
+from calib.calibrate.bench import fit_bench
+from calib.calibrate.starts.bench import BenchNotFitted, SomethingChanged
+from calib.errors import BadFile
+from calib.files import replace_bytes
+from calib.files.mast_file import load_rig
+from calib.geometry.rig import Mast, Rig
+from calib.geometry.rigid import Rigid
+from calib.plan.placements import FEWEST, Placement
+from calib.survey.records import Approach, Sigma, Survey, SurveyCamera, SurveyImage
+from calib.survey.writer import BenchFolder, NotWritten
+from calib.targets.boards import AnyBoard
+from mastctl.bench.mast import BenchLook, SeenBoard
+from mastctl.calibration.differences import implied_motion
+from mastctl.errors import MastctlError
+from mastctl.json_lines import append_line
+
+JOURNAL = "bench.jsonl"
+
+BOARD = "board"
+"""The board's name in a survey."""
+
+FORMER = "former_mast.yaml"
+"""The mast file that was in use when the run began."""
+
+UPRIGHT = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""rover_from_board of a board that stands upright and shows its face to the rover: its x is the rover's y."""
+
+
+class NoSuchFrame(MastctlError):
+    """The object that should define the rover frame is missing."""
+
+    code = "no_such_frame"
+    exit_code = 2
+
+
+@dataclass(frozen=True)
+class RoverFrame:
+    """What fixes the rover frame: one of these, or where the former mast file has the mast.
+
+    ``mast_at``: the mast at zero angles, by a level and a tape: x, y, z, metres, and three angles, radians,
+    as in a mast file. ``board_at``: the board of the first placement: x, y, z of its middle, metres, and yaw,
+    pitch, roll, degrees, about the rover's z, y, x; 0 0 0: upright, its face to the rover. ``body``: body
+    cameras stay where the former mast file has them.
+    """
+
+    mast_at: Sequence[float] | None = None
+    board_at: Sequence[float] | None = None
+    body: bool = False
+
+
+def frame_of(notes: Sequence[Mapping[str, Any]]) -> RoverFrame:
+    """Return what fixes the frame by a run's journal."""
+    note: Mapping[str, Any] = next((note for note in reversed(notes) if note.get("event") == "frame"), {})
+    return RoverFrame(note.get("mast_at"), note.get("board_at"), bool(note.get("body")))
+
+
+class RunFolder:
+    """The folder of one run; whatever it was given is on the disk when a call returns.
+
+    A new folder, or that of a run with the same board, sigmas and cameras, which goes on. Once ``let_go`` is
+    called another run may go on with it; the end of the process does the same. Raises BadFile if the folder
+    holds something else, or another run keeps its looks there.
+    """
+
+    def __init__(self, path: Path, board: AnyBoard, sigma: Sigma, rig: Rig) -> None:
+        self.path, self.sigma_px = path, sigma.corner_px
+        self._cameras = survey_cameras(rig)
+        self._folder = BenchFolder(path, {BOARD: board}, sigma, self._cameras, rig.stereo)
+        self.let_go = weakref.finalize(self, os.close, _locked(path))
+        self._journal = path / JOURNAL
+        self.notes = read_notes(path)
+        self._numbers: dict[str, int] = {}
+        for image in self._folder.survey().images:
+            number = _number_of(image, path)
+            self._numbers[image.placement] = max(number, self._numbers.get(image.placement, 0))
+
+    def begin(self, former: bytes, frame: RoverFrame) -> None:
+        """Keep the mast file in use, unless one is kept already, and what the rover frame hangs on."""
+        path = self.path / FORMER
+        try:
+            if not path.exists():
+                replace_bytes(path, former, 0o644)
+        except OSError as error:
+            raise NotWritten(path, "", f"cannot be written: {error.strerror or error}") from None
+        if frame not in (RoverFrame(), frame_of(self.notes)):
+            self.note(event="frame", **{key: value for key, value in asdict(frame).items() if value})
+
+    def survey(self) -> Survey:
+        """Return all that was seen."""
+        return self._folder.survey()
+
+    def note(self, **line: Any) -> None:
+        """Write a line into the journal."""
+        text = json.dumps(line, allow_nan=False)
+        try:
+            append_line(self._journal, text.encode() + b"\n")
+        except OSError as error:
+            raise NotWritten(self._journal, "", f"cannot be written: {error.strerror or error}") from None
+        self.notes.append(line)
+
+    def add(self, placement: str, look: BenchLook, check: bool) -> None:
+        """Keep the pictures of a look that show the board."""
+        number = self._numbers.get(placement, 0) + 1
+        for one in look.found:
+            name = f"{placement}-{number:03d}-{one.camera}"
+            on_head = self._cameras[one.camera].on == "head"
+            sides = (look.pan_approach, look.tilt_approach) if on_head else (0, 0)
+            image = SurveyImage(
+                name=name,
+                camera=one.camera,
+                setup="",
+                placement=placement,
+                purpose="check" if check else "mast" if on_head else "camera",
+                pan_rad=look.pan_rad if on_head else None,  # at rest: one reading for all cameras
+                tilt_rad=look.tilt_rad if on_head else None,
+                file=Path("images") / f"{name}.png" if one.data else Path(),
+                row=0,
+                board=BOARD,
+                pan_approach=cast(Approach, sides[0]),
+                tilt_approach=cast(Approach, sides[1]),
+            )
+            self._folder.append(image, one.corners, one.data or None)
+        self._numbers[placement] = number
+        self.note(event="look", placement=placement, number=number, seconds=round(look.seconds, 3))
+
+    def requested(self, name: str) -> Placement | None:
+        """Return where a placement was requested; None if it was not, or a kill cut it short."""
+        for note in self.notes:
+            if note.get("event") == "placement" and note.get("name") == name:
+                at = note.get("requested") or note["asked"]
+                return Placement(**{**at, "turned_deg": tuple(at["turned_deg"])})
+        return None
+
+    def is_over(self, name: str) -> bool:
+        """Return whether a placement was ended."""
+        return any(
+            note.get("name") == name and note.get("event") in ("closed", "done") for note in self.notes
+        )
+
+    def seconds(self) -> float:
+        """Return how long all looks took, seconds of the rover's clock."""
+        return sum(float(note.get("seconds", 0.0)) for note in self.notes)
+
+
+def _locked(path: Path) -> int:
+    """A descriptor that keeps every other run out of a folder, until it is closed or the process ends."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        reason = "another run keeps its looks there; wait for its end, or name another folder (--survey)"
+        raise BadFile(path, "", reason) from None
+    return descriptor
+
+
+def former_rig(folder: Path) -> Rig | None:
+    """Return the rig as it was known when a folder's run began; None of a folder that no run wrote.
+
+    Raises BadFile if what is kept is no mast file.
+    """
+    path = folder / FORMER
+    return load_rig(path).rig if path.exists() else None
+
+
+def moved_placements(notes: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    """Return the placements whose first picture, taken again, showed the board aside: by how many pixels."""
+    return {str(note["name"]): float(note["apart_px"]) for note in notes if note.get("event") == "moved"}
+
+
+def survey_cameras(rig: Rig) -> dict[str, SurveyCamera]:
+    """Return what a survey says of a rig's cameras beforehand."""
+    cameras = {}
+    for name, camera in rig.cameras.items():
+        model = camera.model
+        kind = cast(Any, "CAHVOR" if model.kind == "CAHV" else model.kind)
+        focal_px = round(model.focal_px[0], 1)
+        cameras[name] = SurveyCamera(
+            name, camera.on, model.size_px, kind, focal_px, sensor_mode=camera.sensor_mode
+        )
+    return cameras
+
+
+def looks_of(survey: Survey) -> Iterator[tuple[str, bool, BenchLook]]:
+    """Yield what a folder shows, look by look: placement, whether it is a check's, the look."""
+    groups: dict[str, list[SurveyImage]] = {}
+    for image in survey.images:
+        if image.name in survey.corners:
+            groups.setdefault(_look_name(image), []).append(image)
+    for images in groups.values():
+        seen = tuple(
+            SeenBoard(i.camera, i.pan_rad or 0.0, i.tilt_rad or 0.0, survey.corners[i.name]) for i in images
+        )
+        head = next((i for i in images if i.pan_rad is not None), images[0])
+        look = BenchLook(seen, head.pan_approach, head.tilt_approach, 0.0)
+        yield images[0].placement, images[0].purpose == "check", look
+
+
+def _look_name(image: SurveyImage) -> str:
+    """The name of an image without its camera's."""
+    return image.name.removesuffix(f"-{image.camera}")
+
+
+def _number_of(image: SurveyImage, path: Path) -> int:
+    """Which look of its placement an image is of. Raises BadFile for one that no run took."""
+    number = _look_name(image).removeprefix(f"{image.placement}-")
+    if not (number.isascii() and number.isdigit()):
+        reason = (
+            f"{image.name} where PLACEMENT-NUMBER-CAMERA is expected: no run took these pictures; "
+            "fit them by `mastctl calibrate bench FOLDER`, or name another folder for a run (--survey)"
+        )
+        raise BadFile(path / "images.csv", "", reason)
+    return int(number)
+
+
+def read_notes(folder: Path) -> list[dict[str, Any]]:
+    """Return the lines of a run's journal; one that a kill cut short is passed over. Raises BadFile."""
+    path = folder / JOURNAL
+    notes: list[dict[str, Any]] = []
+    try:
+        lines = path.read_bytes().splitlines()
+    except FileNotFoundError:
+        return notes
+    except OSError as error:
+        raise BadFile(path, "", f"cannot be read: {error.strerror or error}") from None
+    for line in lines:
+        try:
+            note = json.loads(line)
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(note, dict):
+            notes.append(note)
+    return notes
+
+
+def rover_from_board(board_at: Sequence[float]) -> Rigid:
+    """Return the pose of a board that is stated in metres and degrees (see `RoverFrame`)."""
+    turn = Rotation.from_euler("ZYX", board_at[3:], degrees=True).as_matrix()
+    return Rigid(turn @ UPRIGHT, np.array(board_at[:3]))
+
+
+def fit_in_frame(
+    survey: Survey,
+    frame: RoverFrame,
+    former: Rig | None,
+    moved: Mapping[str, float] | None = None,
+) -> BenchCalibration:
+    """Fit a bench in the rover frame that was stated; ``former`` is the rig as it was known before.
+
+    ``moved`` as of `moved_placements`: where the fit does not find out what moved when, it does without them.
+    Raises NoSuchFrame if the frame hangs on something that is missing, BenchNotFitted if the images do not
+    determine a rig.
+    """
+    try:
+        return _fit_in_frame(survey, frame, former)
+    except SomethingChanged:
+        raise
+    except BenchNotFitted as reason:
+        rest = tuple(image for image in survey.images if image.placement not in (moved or {}))
+        if not moved or not rest:
+            raise
+        sentences = [
+            f"the board or the head moved during placement {name} (its first picture taken again shows the "
+            f"board {apart_px:.1f} px aside): its pictures are left out"
+            for name, apart_px in moved.items()
+        ]
+        corners = {i.name: survey.corners[i.name] for i in rest if i.name in survey.corners}
+        try:
+            done = _fit_in_frame(replace(survey, images=rest, corners=corners), frame, former)
+        except BenchNotFitted:
+            raise BenchNotFitted(
+                f"{'; '.join(sentences)}, and what is left is too little: {reason}"
+            ) from None
+        return replace(done, notes=(*done.notes, *sentences, f"with these, {reason}"))
+
+
+def _fit_in_frame(survey: Survey, frame: RoverFrame, former: Rig | None) -> BenchCalibration:
+    """The fit of what a survey shows."""
+    survey, notes = without_lonely(survey)
+    stated: dict[str, Any] = {}
+    if frame.mast_at is not None:
+        place = Mast(np.array(frame.mast_at[:3]), np.array(frame.mast_at[3:])).rover_from_mast
+        stated = {"rover_from_mast": place}
+    elif frame.board_at is not None:
+        first = next((i for i in survey.images if i.name in survey.corners), None)
+        if first is None:
+            raise BenchNotFitted("no picture shows a board, and the rover frame should hang on the first")
+        known = (first.board, first.placement), rover_from_board(frame.board_at)
+        stated = {"rover_from_board": known}
+    elif former is not None:
+        stated = {"rover_from_mast": former.mast.rover_from_mast}
+    done = fit_bench(survey, **stated)
+    if frame.body:
+        place, sentence = _by_body(done, former)
+        done = fit_bench(survey, rover_from_mast=place)
+        notes = (*notes, sentence)
+    return replace(done, notes=(*done.notes, *notes))
+
+
+def _by_body(done: BenchCalibration, former: Rig | None) -> tuple[Rigid, str]:
+    """rover_from_mast if the body cameras stay where they were, and a sentence on it."""
+    rig = done.rig
+    if former is None:
+        raise NoSuchFrame("the folder holds no former mast file, and so no place of its body cameras")
+    names = [
+        name
+        for name, camera in rig.cameras.items()
+        if camera.on == "rover" and name in former.cameras and former.cameras[name].on == "rover"
+    ]
+    if not names:
+        raise NoSuchFrame(
+            "no body camera is tied to the head, and so none shows where the rover frame is. Have the board "
+            "placed where one sees it, or say where the mast is (--mast-at)"
+        )
+    pairs = [(rig.cameras[name].model, former.cameras[name].model) for name in names]
+    motion, rms_px = implied_motion(pairs)
+    sentence = (
+        f"the rover frame is where the former mast file has {' and '.join(names)}, which see "
+        f"{rms_px:.2f} px rms beside that"
+    )
+    return motion.inverse @ rig.mast.rover_from_mast, sentence
+
+
+def without_lonely(survey: Survey) -> tuple[Survey, tuple[str, ...]]:
+    """Return the survey without body cameras that nothing ties to the head, and a sentence on each.
+
+    One placement ties none: of it, its focal length and its distance trade for each other.
+    """
+    head = {name for name, camera in survey.cameras.items() if camera.on == "head"}
+    shown = [i for i in survey.images if i.name in survey.corners and i.purpose != "check"]
+    by_head = {(i.board, i.placement) for i in shown if i.camera in head}
+    lonely = {}
+    for name in set(survey.cameras) - head:
+        both = len({(i.board, i.placement) for i in shown if i.camera == name} & by_head)
+        if both < FEWEST:
+            lonely[name] = (
+                f"body camera {name} is not tied to the head: it saw the board at "
+                f"{both or 'no'} placement{'s' * (both > 1)} that the head saw too, {FEWEST} at least are "
+                "expected. Put the board low, where both see it"
+            )
+    images = tuple(i for i in survey.images if i.camera not in lonely)
+    left = replace(
+        survey,
+        cameras={n: c for n, c in survey.cameras.items() if n not in lonely},
+        stereo={n: pair for n, pair in survey.stereo.items() if not set(pair) & set(lonely)},
+        images=images,
+        corners={i.name: survey.corners[i.name] for i in images if i.name in survey.corners},
+    )
+    return left if lonely else survey, tuple(lonely[name] for name in sorted(lonely))
