@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
-import io
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -94,8 +91,8 @@ def load_any(path: str | Path) -> StoredRig | CameraFile | dict[str, CameraFile]
     The content shows the format. Where it does not, the suffix decides which format's refusal helps most.
     Raises BadFile if the file is none of these, or is one but malformed.
     """
-    data = _unzipped(read_bytes(path, MAX_FILE_BYTES), path)
-    suffix = Path(str(path).lower().removesuffix(".gz")).suffix
+    data = read_bytes(path, MAX_FILE_BYTES)
+    suffix = Path(path).suffix.lower()
     if looks_like_mrcal(data) or suffix == ".cameramodel":
         return parse_mrcal(data, path)
     refusal = None
@@ -108,29 +105,16 @@ def load_any(path: str | Path) -> StoredRig | CameraFile | dict[str, CameraFile]
         return parse_camera(data, path)
     if schema is not None or len({"mast", "cameras", "stereo"} & set(document)) > 1:
         return parse_rig(data, path)
-    for looks_so, parse in ((looks_like_kalibr, parse_kalibr), (looks_like_calibration, parse_calibration)):
-        if looks_so(document):
-            cameras = parse(data, path)
-            return next(iter(cameras.values())) if len(cameras) == 1 else cameras
+    if looks_like_kalibr(document):
+        cameras = parse_kalibr(data, path)
+        return next(iter(cameras.values())) if len(cameras) == 1 else cameras
+    if looks_like_calibration(document):
+        return parse_calibration(data, path)
     if suffix == ".cahvor" or looks_like_cahvor(data):
         return parse_cahvor(data, path)
     if refusal is not None and (looks_like_storage(data) or suffix in (".yaml", ".yml", ".xml", ".json")):
         raise refusal
     raise BadFile(path, "", f"is not one of these formats: {KNOWN_FORMATS}")
-
-
-def _unzipped(data: bytes, path: str | Path) -> bytes:
-    """The bytes, those of a gzip file unpacked."""
-    if not data.startswith(b"\x1f\x8b"):
-        return data
-    try:
-        with gzip.open(io.BytesIO(data)) as file:
-            found = file.read(MAX_FILE_BYTES + 1)
-    except (OSError, EOFError, zlib.error) as error:
-        raise BadFile(path, "", f"is no whole gzip file: {error}") from None
-    if len(found) > MAX_FILE_BYTES:
-        raise BadFile(path, "", f"unpacks to more than {MAX_FILE_BYTES} bytes, the most that is read")
-    return found
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,9 @@ as ROS's optical frames. R and P are those of a camera that is not rectified; of
 read, for they do not change what the lens sees.
 
 OpenCV's ``FileStorage`` in YAML, JSON or XML holds ``image_width``, ``image_height``, ``camera_matrix`` and
-``distortion_coefficients`` as the calibration samples write them, ``fisheye_model`` for cv2.fisheye's lens,
-``M1``, ``D1``, ``M2``, ``D2`` for a stereo pair (whose R and T have no stated unit and are not read). OpenCV
-has no keys for where a camera is: this writer adds ``frame`` and ``camera_from_frame`` (4, 4), points of the
-frame to camera axes, and this reader knows them.
+``distortion_coefficients`` as the calibration samples write them, and ``fisheye_model`` for cv2.fisheye's
+lens. OpenCV has no keys for where a camera is: this writer adds ``frame`` and ``camera_from_frame`` (4, 4),
+points of the frame to camera axes, and this reader knows them.
 
 The lens is the family that the file names and as many coefficients as it holds: 0, 4, 5, 8, 12 or 14 of
 cv2.projectPoints (``plumb_bob``, ``rational_polynomial``), 4 of cv2.fisheye (``equidistant``). A key that is
@@ -61,15 +60,6 @@ _OTHER_NAMES = {
     ),
     "image_width": ("image_Width", "width"),
     "image_height": ("image_Height", "height"),
-}
-_PAIR = {
-    side: {
-        "camera_matrix": tuple(f"{name}{number}" for name in ("M", "K", "cameraMatrix", "camera_matrix")),
-        "distortion_coefficients": tuple(
-            f"{name}{number}" for name in ("D", "distCoeffs", "dist_coeffs", "distortion_coefficients")
-        ),
-    }
-    for side, number in (("left", 1), ("right", 2))
 }
 _IGNORED = (
     *("rectification_matrix", "r", "R", "projection_matrix", "p", "P"),
@@ -313,33 +303,17 @@ def looks_like_calibration(document: Mapping[str, object]) -> bool:
     """Return whether a file's keys are those of OpenCV's calibrations or of a camera_info."""
     sure = {"camera_matrix", "distortion_model", "Camera_Matrix", "cameraMatrix"}
     long = {name for field in _OTHER_NAMES for name in (field, *_OTHER_NAMES[field]) if len(name) > 6}
-    pair = {name for side in _PAIR.values() for names in side.values() for name in names}
     keys = set(document)
-    return bool(sure & keys) or any(len(some & keys) > 1 for some in (long, pair, {"K", "width"}))
+    return bool(sure & keys) or any(len(some & keys) > 1 for some in (long, {"K", "width"}))
 
 
-def parse_calibration(data: bytes, path: str | Path) -> dict[str, CameraFile]:
-    """Return the camera of OpenCV's or ROS's file as ``camera``, or the pair ``left`` and ``right``.
+def parse_calibration(data: bytes, path: str | Path) -> CameraFile:
+    """Return the camera of OpenCV's or ROS's file.
 
-    Raises BadFile if one is no camera: which key, what it holds, what is expected.
+    Raises BadFile if it is none: which key, what it holds, what is expected.
     """
-    keys = read_document(data, path)
-    digest = digest_of(data)
-    if not any(key in keys for side in _PAIR.values() for key in side["camera_matrix"]):
-        return {"camera": _calibration(keys, path, digest, _OTHER_NAMES)}
-    found: dict[str, CameraFile] = {}
-    for side, names in _PAIR.items():
-        (others,) = (of_other.values() for other, of_other in _PAIR.items() if other != side)
-        mine = {key: value for key, value in keys.items() if not any(key in some for some in others)}
-        found[side] = _calibration(mine, path, digest, _OTHER_NAMES | names)
-    return found
-
-
-def _calibration(
-    keys: Mapping[str, Any], path: str | Path, digest: str, other_names: Mapping[str, tuple[str, ...]]
-) -> CameraFile:
-    """The camera of a mapping."""
-    record, source = read_foreign(CalibrationRecord, keys, path, "", other_names, _IGNORED)
+    document = read_document(data, path)
+    record, source = read_foreign(CalibrationRecord, document, path, "", _OTHER_NAMES, _IGNORED)
     pose = Rigid.identity()
     if record.camera_from_frame is not None:
         pose = pose_of(source, "camera_from_frame", record.camera_from_frame).inverse
@@ -351,7 +325,7 @@ def _calibration(
         np.array(record.camera_matrix)[[0, 4, 2, 5]],
         pose,
         record.frame,
-        digest,
+        digest_of(data),
     )
 
 

@@ -70,15 +70,13 @@ _CAHVOR = (
 )
 
 
-def _pair() -> bytes:
-    """Two cameras as OpenCV's sample of a stereo calibration writes them, as XML."""
-    store = cv2.FileStorage("pair.xml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
+def _xml() -> bytes:
+    """A camera as OpenCV writes it in XML."""
+    store = cv2.FileStorage("camera.xml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     store.write("image_width", 64)
     store.write("image_height", 48)
-    for number, focal_px in ((1, 60.0), (2, 61.0)):
-        store.write(f"M{number}", np.array([[focal_px, 0.0, 31.9], [0.0, 60.1, 24.1], [0.0, 0.0, 1.0]]))
-    store.write("D1", np.array([[-0.31, 0.12, 0.001, -7e-4, 0.02]]))
-    store.write("D2", np.array([[-0.3], [0.1], [0.0], [0.0]]))
+    store.write("camera_matrix", np.array([[60.0, 0.0, 31.9], [0.0, 60.1, 24.1], [0.0, 0.0, 1.0]]))
+    store.write("distortion_coefficients", np.array([[-0.31, 0.12, 0.001, -7e-4, 0.02]]))
     return store.releaseAndGetString().encode()
 
 
@@ -89,7 +87,7 @@ VALID: dict[str, bytes] = {
     "camera.cahvor": _CAHVOR,
     "product.img": LABEL.encode().ljust(4096) + bytes(range(24)),
     "camera.opencv.yaml": OPENCV.encode(),
-    "pair.xml": _pair(),
+    "camera.xml": _xml(),
     "camera.ros.yaml": INFO.encode(),
     "chain.kalibr.yaml": CHAIN.encode(),
     "camera.cameramodel": MODEL.encode(),
@@ -231,9 +229,9 @@ READERS: dict[str, tuple[str, Callable[[bytes], Any]]] = {
     "cahvor": ("camera.cahvor", lambda data: _use_model(parse_cahvor(data, "f"))),
     "label": ("product.img", lambda data: parse_label(data.decode("latin-1"), "f")),
     "product": ("product.img", lambda data: _product(data, "product.img")),
-    "opencv": ("camera.opencv.yaml", lambda data: _use_all(parse_calibration(data, "f"))),
-    "opencv xml": ("pair.xml", lambda data: _use_all(parse_calibration(data, "f"))),
-    "ros": ("camera.ros.yaml", lambda data: _use_all(parse_calibration(data, "f"))),
+    "opencv": ("camera.opencv.yaml", lambda data: _use_model(parse_calibration(data, "f"))),
+    "opencv xml": ("camera.xml", lambda data: _use_model(parse_calibration(data, "f"))),
+    "ros": ("camera.ros.yaml", lambda data: _use_model(parse_calibration(data, "f"))),
     "kalibr": ("chain.kalibr.yaml", lambda data: _use_all(parse_kalibr(data, "f"))),
     "mrcal": ("camera.cameramodel", lambda data: _use_model(parse_mrcal(data, "f"))),
     "board": ("board.yaml", lambda data: _use_board(parse_board(data, "f"))),

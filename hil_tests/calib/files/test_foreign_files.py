@@ -5,7 +5,6 @@ cv2.projectPoints and cv2.fisheye.projectPoints say where a point falls; cv2.Fil
 
 from __future__ import annotations
 
-import gzip
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ import pytest
 from calib.errors import BadFile
 from calib.files import CameraFile
 from calib.files.any_camera import load_any
-from mastctl.cli.main import main
 
 EXACT_PX = 1e-9
 MATRIX = np.array([[300.0, 0, 320], [0, 300, 240], [0, 0, 1]])
@@ -168,7 +166,7 @@ def test_a_lens_under_camera_model_is_that_lens(tmp_path: Path) -> None:
 # OpenCV's own files.
 
 
-@pytest.mark.parametrize("suffix", [".yml", ".xml", ".json", ".yml.gz", ".xml.gz"])
+@pytest.mark.parametrize("suffix", [".yml", ".xml", ".json"])
 def test_each_form_of_opencvs_storage_is_read(suffix: str, tmp_path: Path) -> None:
     path = storage(
         suffix,
@@ -220,13 +218,6 @@ def test_a_broken_storage_is_refused_in_one_line(
     assert capfd.readouterr().err == ""
 
 
-@pytest.mark.parametrize("cut", [-5, 5])
-def test_a_cut_gzip_file_is_refused(cut: int, tmp_path: Path) -> None:
-    (tmp_path / "a.yml.gz").write_bytes(gzip.compress(b"%YAML:1.0\n---\na: 1\n")[:cut])
-    with pytest.raises(BadFile, match="gzip"):
-        load_any(tmp_path / "a.yml.gz")
-
-
 @pytest.mark.parametrize(
     ("old", "new", "phrase"),
     [
@@ -239,40 +230,6 @@ def test_a_cut_gzip_file_is_refused(cut: int, tmp_path: Path) -> None:
 def test_a_misspelled_key_gets_the_nearest_known_one(old: str, new: str, phrase: str, tmp_path: Path) -> None:
     text = (SIZE + K_LINE + coefficients(LENSES[5])).replace(old, new)
     assert phrase in refusal(tmp_path, text)
-
-
-def test_a_stereo_file_of_opencv_is_read_by_left_and_right(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    right = MATRIX + np.array([[10.0, 0, 2], [0, 11, 3], [0, 0, 0]])
-    path = storage(
-        ".yml",
-        tmp_path,
-        M1=MATRIX,
-        D1=np.array([LENSES[8]]),
-        M2=right,
-        D2=np.array([LENSES[5]]),
-        R=np.eye(3),
-        T=np.array([[-60.0, 0, 0]]).T,
-        image_width=640,
-        image_height=480,
-    )
-    (tmp_path / "p.csv").write_text("x_m,y_m,z_m\n1,0.75,1\n")
-    for side, matrix, numbers in (("left", MATRIX, LENSES[8]), ("right", right, LENSES[5])):
-        command = ["camera", "project", str(path), "--camera", side, "--points", str(tmp_path / "p.csv")]
-        assert main(command) == 0
-        out, err = capsys.readouterr()
-        pixel = np.array([float(number) for number in out.splitlines()[1].split(",")])
-        np.testing.assert_allclose(pixel, pinhole_px(numbers, matrix)[0], atol=EXACT_PX)
-        assert "T not read" in err
-    assert main(["camera", "project", str(path), "--points", str(tmp_path / "p.csv")]) == 2
-    assert "--camera with one of left, right" in capsys.readouterr().err
-
-
-def test_a_bad_side_of_a_stereo_file_is_named(tmp_path: Path) -> None:
-    path = storage(".yml", tmp_path, M1=MATRIX, D1=np.zeros((1, 3)), M2=MATRIX, D2=np.zeros((1, 5)))
-    phrase = "D1: 3 coefficients where one of 0, 4, 5, 8, 12, 14"
-    assert phrase in refusal(tmp_path, path.read_text() + SIZE)
 
 
 # ROS.
