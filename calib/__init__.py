@@ -1,7 +1,7 @@
 """Geometry, measurement, estimation and storage: arrays and frozen dataclasses in and out.
 
 The names below are the library's interface; docs/reference/calib.md has each with an example. A
-name is imported when it is first asked for, so that ``import calib`` by itself loads nothing else.
+name is imported when it is first used, so that ``import calib`` by itself loads nothing else.
 """
 
 from importlib import import_module
@@ -39,53 +39,38 @@ if TYPE_CHECKING:
     from calib.targets.corners import find_corners as find_corners
     from calib.targets.dots import find_dots as find_dots
 
-_MODULES = {
-    "calib.adjust.robust": ("SurveyNotFitted",),
-    "calib.calibrate.paper": ("fit_paper",),
-    "calib.calibrate.survey": ("fit_joint",),
-    "calib.errors": (
-        "BadFile",
-        "CalibError",
-        "NoHandoff",
-        "NoStereoPoint",
-        "Unreachable",
-    ),
-    "calib.files": ("CameraFile",),
-    "calib.files.any_camera": (
-        "load_any",
-        "save_any",
-    ),
-    "calib.files.mast_file": (
-        "load_rig",
-        "save_rig",
-    ),
-    "calib.geometry.cahvor": ("CameraModel",),
-    "calib.geometry.handoff": (
-        "Joints",
-        "hand_off",
-    ),
-    "calib.geometry.pointing": (
-        "choose",
-        "solve",
-    ),
-    "calib.geometry.rig": (
-        "Mast",
-        "Rig",
-        "RigCamera",
-    ),
-    "calib.geometry.stereo": ("triangulate",),
-    "calib.survey.check": ("check_survey",),
-    "calib.survey.find_dots": ("detect_survey",),
-    "calib.survey.reader": ("read_survey",),
-    "calib.survey.writer": ("write_survey",),
-    "calib.targets.board_file": ("load_board",),
-    "calib.targets.corners": (
-        "CornersNotFound",
-        "find_corners",
-    ),
-    "calib.targets.dots": ("find_dots",),
+_MODULE_OF = {
+    "SurveyNotFitted": "adjust.robust",
+    "fit_paper": "calibrate.paper",
+    "fit_joint": "calibrate.survey",
+    "BadFile": "errors",
+    "CalibError": "errors",
+    "NoHandoff": "errors",
+    "NoStereoPoint": "errors",
+    "Unreachable": "errors",
+    "CameraFile": "files",
+    "load_any": "files.any_camera",
+    "save_any": "files.any_camera",
+    "load_rig": "files.mast_file",
+    "save_rig": "files.mast_file",
+    "CameraModel": "geometry.cahvor",
+    "Joints": "geometry.handoff",
+    "hand_off": "geometry.handoff",
+    "choose": "geometry.pointing",
+    "solve": "geometry.pointing",
+    "Mast": "geometry.rig",
+    "Rig": "geometry.rig",
+    "RigCamera": "geometry.rig",
+    "triangulate": "geometry.stereo",
+    "check_survey": "survey.check",
+    "detect_survey": "survey.find_dots",
+    "read_survey": "survey.reader",
+    "write_survey": "survey.writer",
+    "load_board": "targets.board_file",
+    "CornersNotFound": "targets.boards",
+    "find_corners": "targets.corners",
+    "find_dots": "targets.dots",
 }
-_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 if not TYPE_CHECKING:  # a type checker reads the imports above, and would take any name for one of these
     __all__ = sorted(_MODULE_OF)
@@ -94,7 +79,7 @@ if not TYPE_CHECKING:  # a type checker reads the imports above, and would take 
         """Import a name from its module, once."""
         if name not in _MODULE_OF:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        value = getattr(import_module(_MODULE_OF[name]), name)
+        value = getattr(import_module(f"calib.{_MODULE_OF[name]}"), name)
         globals()[name] = value
         return value
 

@@ -12,14 +12,8 @@ class CalibError(Exception):
 class BadFile(CalibError):
     """A file that cannot be used: which file, which place in it, and what would be right.
 
-    Parameters
-    ----------
-    path
-        The file, as the user named it.
-    place
-        Key, row or line inside the file (``cameras.navcam_left.A``, ``row 12``); empty for the whole file.
-    reason
-        The fault, with the value, and the expected one.
+    ``place`` is the key, row or line inside the file (``cameras.navcam_left.A``, ``row 12``), empty for the
+    whole file; ``reason`` the fault, with the value, and the expected one.
     """
 
     def __init__(self, path: str | Path, place: str, reason: str) -> None:
@@ -31,51 +25,40 @@ class BadFile(CalibError):
 
 
 def _one_line(text: str, limit: int) -> str:
-    """Return the text on one line of bounded length: a file's keys and words can hold anything."""
+    """Return the text on one line of bounded length: a file's keys and values can hold anything."""
     shown = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text[: limit + 1])
     return shown if len(shown) <= limit else f"{shown[:limit]}..."
 
 
-class Unreachable(CalibError):
-    """No joint angles bring the target onto the pixel; ``code`` names the cause for programs.
+class CodedError(CalibError):
+    """An error whose ``code`` names the cause for programs."""
+
+    def __init__(self, code: str, message: str) -> None:
+        self.code = code
+        super().__init__(message)
+
+
+class Unreachable(CodedError):
+    """No joint angles bring the target onto the pixel.
 
     Codes: ``blind_cone``, ``too_near``, ``outside_limits``, ``bad_pixel``, ``bad_target``, ``parallel_axes``,
     ``bad_joints``.
     """
 
-    def __init__(self, code: str, message: str) -> None:
-        self.code = code
-        super().__init__(message)
 
-
-class NoStereoPoint(CalibError):
-    """Two rays that do not meet in front of both cameras; ``code`` names the cause for programs.
+class NoStereoPoint(CodedError):
+    """Two rays that do not meet in front of both cameras.
 
     Codes: ``parallel_rays``, ``behind_camera``, ``bad_pixel``, ``not_one_point``.
     """
 
-    def __init__(self, code: str, message: str) -> None:
-        self.code = code
-        super().__init__(message)
+
+class NoHandoff(CodedError):
+    """A target that cannot be handed to another camera; codes: ``too_near``, ``too_far``, ``not_seen``."""
 
 
-class NoHandoff(CalibError):
-    """A target that cannot be handed to another camera; ``code`` names the cause for programs.
-
-    Codes: ``too_near``, ``too_far``, ``not_seen``.
-    """
-
-    def __init__(self, code: str, message: str) -> None:
-        self.code = code
-        super().__init__(message)
-
-
-class NoCorrection(CalibError):
-    """Hand-offs that give no correction of a rig; ``code`` names the cause for programs.
+class NoCorrection(CodedError):
+    """Hand-offs that give no correction of a rig.
 
     Codes: ``too_few``, ``one_sided``, ``inconsistent``, ``not_significant``, ``not_settled``.
     """
-
-    def __init__(self, code: str, message: str) -> None:
-        self.code = code
-        super().__init__(message)
