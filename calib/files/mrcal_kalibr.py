@@ -46,7 +46,7 @@ from calib.files.opencv_ros import (
 from calib.files.records import ABSENT, Number, Record, Text
 from calib.files.twin import FISHEYE
 from calib.files.yaml_text import dump_mapping, kind_of, parse_mapping
-from calib.geometry.cahvor import FREE, CameraModel, Kind
+from calib.geometry.cahvor import FREE, CameraModel
 from calib.geometry.rigid import FloatArray, Rigid
 
 _INPUTS = re.compile(rb"""['"]optimization_inputs['"]\s*:\s*b(?:'[^']*'|"[^"]*")\s*,?""")
@@ -150,27 +150,39 @@ def _cahvor(
         "O": frame_from_camera.vectors(o),
         "R": numbers[6:9],
     }
-    kind: Kind = "CAHVOR"
-    cahvore_type, linearity = 0, None
-    if match:
-        kind, vectors["E"] = "CAHVORE", numbers[9:]
-        with contextlib.suppress(ValueError):
-            linearity = float(match[1])
-        if linearity is None or not abs(linearity) <= 100.0:
-            reason = f"linearity {match[1][:20]} where a number from -100 to 100 is expected"
-            raise source.bad("lensmodel", reason)
-        cahvore_type = {1.0: 1, 0.0: 2}.get(linearity, 3)
     size_px = record.imagersize[0], record.imagersize[1]
-    return build_model(source.path, "", kind, size_px, vectors, cahvore_type, linearity)
+    if not match:
+        return build_model(source.path, "", "CAHVOR", size_px, vectors)
+    linearity = math.nan
+    with contextlib.suppress(ValueError):
+        linearity = float(match[1])
+    if not abs(linearity) <= 100.0:
+        reason = f"linearity {match[1][:20]} where a number from -100 to 100 is expected"
+        raise source.bad("lensmodel", reason)
+    cahvore_type = {1.0: 1, 0.0: 2}.get(linearity, 3)
+    vectors["E"] = numbers[9:]
+    return build_model(source.path, "", "CAHVORE", size_px, vectors, cahvore_type, linearity)
 
 
 def format_mrcal(camera: CameraModel, frame: str) -> bytes:
     """Return a camera as a .cameramodel; its H and V are at right angles."""
+    pose = camera.pose
+    x, y, _ = pose.rotation.T
+    name = "LENSMODEL_PINHOLE" if camera.kind == "CAHV" else f"LENSMODEL_{camera.kind}"
+    numbers = [
+        float(camera.H @ x),
+        float(camera.V @ y),
+        float(camera.H @ camera.A),
+        float(camera.V @ camera.A),
+    ]
     if camera.kind in FREE:
-        name, pose = f"LENSMODEL_{camera.kind}", camera.pose
         numbers = [*intrinsics_of(camera), *camera.distortion]
-    else:
-        name, numbers, pose = _numbers_of(camera)
+    elif camera.kind != "CAHV":
+        o = pose.rotation.T @ camera.O
+        numbers += [math.atan2(o[0], o[2]), math.asin(min(1.0, max(-1.0, float(o[1])))), *camera.R]
+    if camera.kind == "CAHVORE":
+        name += f"_linearity={np.format_float_positional(camera.linearity, unique=True, trim='0')}"
+        numbers += [*camera.E]
     camera_from_frame = pose.inverse
     turn = Rotation.from_matrix(camera_from_frame.rotation).as_rotvec()
     extrinsics = [*turn, *camera_from_frame.translation_m]
@@ -184,23 +196,6 @@ def format_mrcal(camera: CameraModel, frame: str) -> bytes:
     'imagersize': {list(camera.size_px)},
 }}
 """.encode()
-
-
-def _numbers_of(model: CameraModel) -> tuple[str, list[float], Rigid]:
-    """Lens model, intrinsics and pose of a camera of the CAHV family."""
-    hc, vc = float(model.H @ model.A), float(model.V @ model.A)
-    pose = model.pose
-    x, y, _ = pose.rotation.T
-    core = [float(model.H @ x), float(model.V @ y), hc, vc]
-    if model.kind == "CAHV":
-        return "LENSMODEL_PINHOLE", core, pose
-    o = pose.rotation.T @ model.O
-    axis = [math.atan2(o[0], o[2]), math.asin(min(1.0, max(-1.0, float(o[1]))))]
-    numbers = [*core, *axis, *model.R.tolist()]
-    if model.kind == "CAHVOR":
-        return "LENSMODEL_CAHVOR", numbers, pose
-    linearity = np.format_float_positional(model.linearity, unique=True, trim="0")
-    return f"LENSMODEL_CAHVORE_linearity={linearity}", [*numbers, *model.E.tolist()], pose
 
 
 _CAMERA = re.compile(r"cam(0|[1-9][0-9]?)")
