@@ -27,28 +27,28 @@ from calib.geometry.rigid import FloatArray, IntArray
 from calib.targets.boards import CornersNotFound, DotBoard, Grey8
 from calib.targets.dot_middles import centred
 
-DEGREES = {0: 0, 3: 40, 5: 90}
-"""Of the polynomial, and for how many dots."""
+TERMS = {10: 40, 21: 90}
+"""Of the polynomial, of degree 3 and 5, and for how many dots."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlaneMap:
     """Places on the board, metres, to pixels.
 
-    ``homography`` (3, 3) acts on metres; ``bend`` (terms, 2), px, on the powers of metres / ``scale_m``.
+    ``homography`` (3, 3) acts on metres; ``bend`` (terms, 2), px, on the powers of metres / ``scale_m`` (of
+    none: a plane without a lens).
     """
 
     homography: FloatArray
     bend: FloatArray
-    degree: int
     scale_m: float
 
     def pixels(self, points_m: ArrayLike) -> FloatArray:
         """Return pixels (..., 2) of points (..., 2), metres in the board's plane."""
         points = np.asarray(points_m, dtype=np.float64)
         pixels = carried(self.homography, points)
-        if self.degree:
-            pixels = pixels + _powers(points / self.scale_m, self.degree) @ self.bend
+        if len(self.bend):
+            pixels = pixels + _powers(points / self.scale_m, len(self.bend)) @ self.bend
         return np.asarray(pixels)
 
     def jacobian(self, points_m: ArrayLike) -> FloatArray:
@@ -94,20 +94,18 @@ def fit_plane_map(points_m: FloatArray, pixels_px: FloatArray) -> PlaneMap | Non
         return None
     back = np.array([[1.0, 0.0, middle[0]], [0.0, 1.0, middle[1]], [0.0, 0.0, 1.0]])
     whole = np.asarray(back @ H @ np.diag([1 / scale, 1 / scale, 1.0]), dtype=np.float64)
-    degree = max(degree for degree, least in DEGREES.items() if len(points_m) >= least)
-    flat = PlaneMap(whole, np.empty((0, 2)), 0, scale)
-    if not degree:
+    flat = PlaneMap(whole, np.empty((0, 2)), scale)
+    terms = max((terms for terms, least in TERMS.items() if len(points_m) >= least), default=0)
+    if not terms:
         return flat
-    powers = _powers(points_m / scale, degree)
+    powers = _powers(points_m / scale, terms)
     bend, _, rank, _ = np.linalg.lstsq(powers, pixels_px - flat.pixels(points_m), rcond=1e-9)
-    if rank < powers.shape[1]:
-        return flat
-    return PlaneMap(whole, np.asarray(bend, dtype=np.float64), degree, scale)
+    return PlaneMap(whole, np.asarray(bend, dtype=np.float64), scale) if rank == terms else flat
 
 
-def _powers(points: FloatArray, degree: int) -> FloatArray:
-    """x**i y**j for i + j up to the degree, along the last axis."""
-    x, y = points[..., 0], points[..., 1]
+def _powers(points: FloatArray, terms: int) -> FloatArray:
+    """x**i y**j along the last axis: i + j up to 3 for 10 terms, up to 5 for 21."""
+    x, y, degree = points[..., 0], points[..., 1], {10: 3, 21: 5}[terms]
     return np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)
 
 
@@ -124,6 +122,10 @@ class Candidates(NamedTuple):
 
     middles_px: FloatArray
     shapes_px: FloatArray
+
+    def some(self, good: NDArray[np.bool_]) -> Candidates:
+        """Return some of them."""
+        return Candidates(self.middles_px[good], self.shapes_px[good])
 
 
 def dot_candidates(
@@ -150,13 +152,13 @@ def dot_candidates(
     good = (area >= max(6, area_px2[0])) & (area <= area_px2[1])
     good &= (longest <= 1.6 * diameter_px + 3) & (longest <= WIDEST_RATIO * np.minimum(width, height))
     good[0] = False
-    if not good.any():
-        return Candidates(np.empty((0, 2)), np.empty((0, 2, 2)))
-    kept = _ellipses(np.asarray(labels, dtype=np.int32), np.flatnonzero(good), count)
-    kept = _in_paper(smooth, kept, uneven)
-    if len(kept.middles_px) > 3000:  # gravel
-        return Candidates(np.empty((0, 2)), np.empty((0, 2, 2)))
-    return kept
+    found = _ellipses(np.asarray(labels, dtype=np.int32), np.flatnonzero(good), count)
+    if not len(found.middles_px):
+        return found
+    contrast_dn, spread_dn = contrasts(smooth, *found)
+    with np.errstate(invalid="ignore"):
+        in_paper = (contrast_dn > LEAST_CONTRAST_DN) & (spread_dn < uneven * contrast_dn)
+    return found.some(in_paper & (in_paper.sum() <= 3000))  # more are gravel
 
 
 def _ellipses(labels: NDArray[np.int32], wanted: NDArray[np.int64], count: int) -> Candidates:
@@ -185,7 +187,7 @@ def _ellipses(labels: NDArray[np.int32], wanted: NDArray[np.int64], count: int) 
     spread = np.sqrt(np.maximum((xx + yy) ** 2 / 4 - root**2, 0.0))
     flat = np.sqrt(((xx + yy) / 2 + spread) / np.maximum((xx + yy) / 2 - spread, 1e-9))
     good = (fill > FILL[0]) & (fill < FILL[1]) & (flat < WIDEST_RATIO)
-    return Candidates(np.stack([mx, my], axis=-1)[good], shapes[good])
+    return Candidates(np.stack([mx, my], axis=-1), shapes).some(good)
 
 
 def contrasts(smooth: Grey8, middles_px: FloatArray, shapes_px: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -200,7 +202,12 @@ def contrasts(smooth: Grey8, middles_px: FloatArray, shapes_px: FloatArray) -> t
     ring = middles_px[:, None, :] + ((1.6 + 0.5 / length) * (shapes_px @ circle)).transpose(0, 2, 1)
     points = np.concatenate([middles_px[:, None, :], ring], axis=1)
     columns, rows = np.moveaxis(points.astype(np.float32), -1, 0)
-    values = _sampled(smooth, columns, rows)
+    grey = smooth.astype(np.float32)
+    pieces = [  # OpenCV wants fewer than 32767 rows
+        cv2.remap(grey, columns[k : k + 30000], rows[k : k + 30000], cv2.INTER_LINEAR)
+        for k in range(0, len(columns), 30000)
+    ]
+    values = np.concatenate(pieces).astype(np.float64)
     height, width = smooth.shape
     inside = (columns >= 0) & (rows >= 0) & (columns <= width - 1) & (rows <= height - 1)
     seen = inside[:, 1:].sum(axis=1)
@@ -209,25 +216,6 @@ def contrasts(smooth: Grey8, middles_px: FloatArray, shapes_px: FloatArray) -> t
         mean = np.where(inside[:, 0] & (seen >= 2 / 3 * RING_POINTS), paper.sum(axis=1) / seen, np.nan)
         spread = np.where(inside[:, 1:], paper - mean[:, None], 0.0)
         return mean - values[:, 0], np.sqrt((spread**2).sum(axis=1) / seen)
-
-
-def _sampled(image: Grey8, columns: NDArray[np.float32], rows: NDArray[np.float32]) -> FloatArray:
-    """Bilinear values; in pieces, since OpenCV wants fewer than 32767 rows."""
-    pieces = [
-        cv2.remap(image.astype(np.float32), columns[k : k + 30000], rows[k : k + 30000], cv2.INTER_LINEAR)
-        for k in range(0, len(columns), 30000)
-    ]
-    return np.concatenate(pieces).astype(np.float64)
-
-
-def _in_paper(smooth: Grey8, spots: Candidates, uneven: float) -> Candidates:
-    """Return the spots with an even bright ring around them."""
-    if not len(spots.middles_px):
-        return spots
-    contrast, spread = contrasts(smooth, *spots)
-    with np.errstate(invalid="ignore"):
-        good = (contrast > LEAST_CONTRAST_DN) & (spread < uneven * contrast)
-    return Candidates(spots.middles_px[good], spots.shapes_px[good])
 
 
 NEAR = 0.35  # how far a neighbour may be from where it is expected, in spacings
@@ -267,27 +255,25 @@ def _links(found: Candidates, spacing_over_radius: float) -> list[list[int]]:
     nearest = cKDTree(found.middles_px).query(found.middles_px, k=min(11, count))[1]
     near = np.asarray(nearest)[:, 1:]
     offsets = found.middles_px[near] - found.middles_px[:, None, :]
-    there = _in_circles(np.linalg.inv(found.shapes_px)[:, None], offsets)
-    back = _in_circles(np.linalg.inv(found.shapes_px)[near], offsets)
+    undo = np.linalg.inv(found.shapes_px)
+    steps = [  # in dot radii with the tilt undone, as either of the two has it
+        np.linalg.norm(np.einsum("...ij,...j->...i", tilt, offsets), axis=-1) / spacing_over_radius
+        for tilt in (undo[:, None], undo[near])
+    ]
     area = np.abs(np.linalg.det(found.shapes_px))
     ratio = area[near] / area[:, None]
-    off = np.maximum(abs(there / spacing_over_radius - 1.0), abs(back / spacing_over_radius - 1.0))
+    off = np.abs(np.array(steps) - 1.0).max(axis=0)
     good = (off < NEAR) & (ratio > SIZES[0]) & (ratio < SIZES[1])
     return [near[i][good[i]].tolist() for i in range(count)]
 
 
-def _in_circles(undo: NDArray[Any], offsets: FloatArray) -> FloatArray:
-    """Lengths of offsets with the tilt undone, in dot radii."""
-    return np.asarray(np.linalg.norm(np.einsum("...ij,...j->...i", undo, offsets), axis=-1))
-
-
 def _grown(middles: FloatArray, links: list[list[int]], start: int) -> Lattice | None:
-    """Give whole coordinates to everything that hangs together with ``start``."""
+    """Give whole coordinates to everything that is linked with ``start``."""
     basis = _first_basis(middles, links, start)
     if basis is None:
         return None
     place = {start: (0, 0)}
-    taken = {(0, 0): start}
+    taken = {(0, 0)}
     bases = {start: basis}
     queue = deque([start])
     while queue:
@@ -302,7 +288,8 @@ def _grown(middles: FloatArray, links: list[list[int]], start: int) -> Lattice |
             there = (place[i][0] + int(whole[0]), place[i][1] + int(whole[1]))
             if j in place or there in taken:
                 continue
-            place[j], taken[there] = there, j
+            place[j] = there
+            taken.add(there)
             axis = int(whole[1] != 0)
             bases[j] = bases[i].copy()
             bases[j][:, axis] = step * whole[axis]
@@ -318,9 +305,7 @@ def _unsheared(places: IntArray) -> IntArray:
     A small dot seen at a slant is blurred round, and a neighbour across the diagonal taken for the one
     beside: such a grid is whole but counted aslant.
     """
-    turns = [np.eye(2, dtype=np.int64)]
-    for k in (-1, 1):
-        turns += [np.array([[1, k], [0, 1]]), np.array([[1, 0], [k, 1]])]
+    turns = [np.array([[1, k], [m, 1]]) for k, m in ((0, 0), (-1, 0), (0, -1), (1, 0), (0, 1))]
     while True:
         box = [int(np.prod(np.ptp(places @ turn.T, axis=0) + 1)) for turn in turns]
         best = int(np.argmin(box))
