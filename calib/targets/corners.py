@@ -8,13 +8,11 @@ do not fit the smooth map of the others are dropped. Dots are left to `calib.tar
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.geometry.rigid import FloatArray
 from calib.targets.board_file import FAMILIES
 from calib.targets.boards import (
     AnyBoard,
@@ -42,7 +40,7 @@ from calib.targets.markers import (
     search,
 )
 from calib.targets.pattern import Cells, pattern_of
-from calib.targets.saddles import Crossings, Saddles, fit_saddles
+from calib.targets.saddles import NO_SADDLES, Crossings, Saddles, fit_saddles
 
 MOST_ELSEWHERE = 0.5
 """Of the markers found; if more do not stand as on the board, it is another."""
@@ -204,13 +202,6 @@ def find_corners(board: AnyBoard, image: Levels) -> Corners | CornersNotFound:
     return _agreeing(board, found)
 
 
-class _Found(NamedTuple):
-    """Corners that were fitted: ids (n,), and what `fit_saddles` says of them."""
-
-    ids: NDArray[np.int64]
-    saddles: Saddles
-
-
 def _placed(board: MarkerBoard, image: Grey8) -> PlacedMarkers | CornersNotFound:
     """The markers that stand as on the board, or what is wrong."""
     markers = detect(image, board)
@@ -239,50 +230,35 @@ def _beside(board: MarkerBoard, placed: PlacedMarkers) -> MeasuredCorners:
 
 def _fitted(
     board: Charuco | AprilGrid | Checkerboard, levels: Levels, pattern: Cells, start: MeasuredCorners
-) -> _Found:
+) -> Saddles:
     """The corners that the start names, and those that lie beside what was found."""
     places = board.in_board_m(board.ids)[:, :2]
-    printed = Crossings(pattern, places, _insets_m(board))
-    ids, found = start.ids, None
-    tried = set(map(int, ids))
-    while len(ids):
-        new = fit_saddles(levels, printed.some(ids), start.pixels_px, start.jacobians, FARTHEST_PX)
-        both = (
-            new
-            if found is None
-            else Saddles(*(np.concatenate(two) for two in zip(found.saddles, new, strict=True)))
-        )
-        every = ids if found is None else np.concatenate([found.ids, ids])
-        good = _good(both)
-        found = _Found(every[good], Saddles(*(part[good] for part in both)))
-        if len(found.ids) < FEWEST:
+    inset_m = np.full(2, np.inf)  # markers begin in the white squares of a ChArUco board alone
+    if isinstance(board, Charuco):
+        inset_m = (board.square_m - board.marker_m) / 2 * np.array([1.0, board.aspect])
+    printed = Crossings(pattern, board.ids, places, inset_m)
+    found, tried = NO_SADDLES, np.zeros(len(places), dtype=bool)
+    while len(start.ids):
+        tried[start.ids] = True
+        crossings = printed.some(start.ids)
+        more = fit_saddles(levels, crossings, start.pixels_px, start.jacobians, FARTHEST_PX)
+        found = Saddles._make(map(np.concatenate, zip(found, more, strict=True)))
+        found = found.some(_good(found))
+        if len(found.ids) < FEWEST or tried.all():
             break
-        rest = np.array([one for one in board.ids if int(one) not in tried], dtype=np.int64)
-        if not len(rest):
-            break
-        known = MeasuredCorners(places[found.ids], found.saddles.pixels_px)
-        ids = known.next_to(rest, places, board.lines_m)
-        tried |= set(map(int, ids))
+        known = MeasuredCorners(places[found.ids], found.pixels_px)
+        ids = known.next_to(board.ids[~tried], places, board.lines_m)
+        tried[ids] = True
+        # less where the corners found lie too badly to say where the next one is
         start = predicted(known, ids, places[ids])
-        ids = start.ids  # less where the corners found lie too badly to say where the next one is
-    if found is None:
-        return _Found(ids, fit_saddles(levels, printed.some(ids), start.pixels_px, start.jacobians, 0.0))
     return found
 
 
-def _insets_m(board: Charuco | AprilGrid | Checkerboard) -> FloatArray:
-    """How far from a corner, across and down, markers begin in the white squares; infinite: nowhere."""
-    if not isinstance(board, Charuco):
-        return np.full(2, np.inf)
-    return (board.square_m - board.marker_m) / 2 * np.array([1.0, board.aspect])
-
-
-def _inside(found: _Found, shape: tuple[int, ...]) -> _Found:
+def _inside(found: Saddles, shape: tuple[int, ...]) -> Saddles:
     """Leave out what is nearer to the image's rim than two standard deviations of the blur, or beside it."""
-    rim = 2.0 * found.saddles.wide_px.max(axis=1, initial=0.0) - 0.5
-    x, y = found.saddles.pixels_px.T
-    kept = (x > rim) & (y > rim) & (x < shape[1] - 1 - rim) & (y < shape[0] - 1 - rim)
-    return _Found(found.ids[kept], Saddles(*(part[kept] for part in found.saddles)))
+    rim = 2.0 * found.wide_px.max(axis=1, initial=0.0) - 0.5
+    x, y = found.pixels_px.T
+    return found.some((x > rim) & (y > rim) & (x < shape[1] - 1 - rim) & (y < shape[0] - 1 - rim))
 
 
 def _good(saddles: Saddles) -> NDArray[np.bool_]:
@@ -301,11 +277,11 @@ def _good(saddles: Saddles) -> NDArray[np.bool_]:
         return np.asarray(good & (left_over < max(0.12, 3.0 * float(np.nanmedian(left_over)))))
 
 
-def _agreeing(board: AnyBoard, found: _Found) -> Corners | CornersNotFound:
+def _agreeing(board: AnyBoard, found: Saddles) -> Corners | CornersNotFound:
     """The corners that fit a smooth map of all."""
     points = board.in_board_m(found.ids)[:, :2]
-    pixels = found.saddles.pixels_px
-    sigma = np.hypot(found.saddles.sigma_px, 0.001)  # the best that aliasing and whole grey levels allow
+    pixels = found.pixels_px
+    sigma = np.hypot(found.sigma_px, 0.001)  # the best that aliasing and whole grey levels allow
     good = np.ones(len(points), dtype=bool)
     for _ in range(6):
         plane_map = fit_plane_map(points[good], pixels[good])

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import erf
 
-from calib.geometry.rigid import FloatArray
+from calib.geometry.rigid import FloatArray, IntArray
 from calib.targets.boards import Levels
 from calib.targets.dot_middles import diagonals, windows
 from calib.targets.pattern import Cells
@@ -39,9 +39,8 @@ ROOT_2, ROOT_2_PI = np.sqrt(2.0), np.sqrt(2.0 * np.pi)
 class Edge(NamedTuple):
     """An edge through the corner, from -1 to 1.
 
-    normal: its cosine and sine (n, 1); then (n, p): along it, pixels; z, distance over ``wide``; wide (n,
-    1), the standard deviation of all that blurs it; step, its profile; slope and by_blur, the profile's
-    derivatives.
+    normal: its cosine and sine (n, 1); wide (n, 1), the standard deviation of all that blurs it; then (n, p):
+    along it, pixels; z, distance over ``wide``; step, its profile; slope and by_blur, its derivatives.
     """
 
     normal: tuple[FloatArray, FloatArray]
@@ -164,15 +163,16 @@ border that is printed a little elsewhere does no harm."""
 
 
 class Crossings(NamedTuple):
-    """Corners on a print, points_m (n, 2); markers begin inset_m (2,) from a corner, across and down."""
+    """Corners on a print, ids (n,) at points_m (n, 2); markers begin inset_m (2,) away, across and down."""
 
     pattern: Cells
+    ids: IntArray
     points_m: FloatArray
     inset_m: FloatArray
 
     def some(self, which: NDArray[np.int64]) -> Crossings:
         """Return some of them."""
-        return self._replace(points_m=self.points_m[which])
+        return self._replace(ids=self.ids[which], points_m=self.points_m[which])
 
     def signs(self, jacobians: FloatArray) -> FloatArray:
         """Return (n,) +1 where the square to the lower right is white, -1 where it is black."""
@@ -254,17 +254,26 @@ MOST_TOGETHER = 0.9
 class Saddles(NamedTuple):
     """Fitted corners, not-a-number where the fit found none.
 
-    pixels_px (n, 2); sigma_px (n,) one standard deviation per axis, from the noise that the fit left;
+    ids (n,) on the board; pixels_px (n, 2); sigma_px (n,) one standard deviation per axis, from the noise;
     wide_px (n, 2) standard deviation of what blurs the edges, pixels included, across columns and rows;
-    contrast (n,) half of white less black; noise (n,) root mean square of what the fit left over, in grey
-    levels.
+    contrast (n,) half of white less black; noise (n,) rms of what the fit left over, grey levels.
     """
 
+    ids: IntArray
     pixels_px: FloatArray
     sigma_px: FloatArray
     wide_px: FloatArray
     contrast: FloatArray
     noise: FloatArray
+
+    def some(self, good: NDArray[np.bool_]) -> Saddles:
+        """Return some of them."""
+        return Saddles._make(part[good] for part in self)
+
+
+NO_SADDLES = Saddles(
+    np.empty(0, np.int64), np.empty((0, 2)), np.empty(0), np.empty((0, 2)), np.empty(0), np.empty(0)
+)
 
 
 def fit_saddles(
@@ -276,8 +285,7 @@ def fit_saddles(
     A fit that moves farther than ``farthest_px`` has found another corner, and is none.
     """
     if not len(pixels_px):
-        nothing = np.empty(0)
-        return Saddles(np.empty((0, 2)), nothing, np.empty((0, 2)), nothing, nothing)
+        return NO_SADDLES
     signs = crossings.signs(jacobians)
     slopes = np.linalg.norm(np.linalg.inv(jacobians), axis=2)  # of the board's x and y, m/px
     insets = np.column_stack([crossings.inset_m / slopes, signs])
@@ -308,10 +316,10 @@ def fit_saddles(
     contrast = state[:, CONTRAST] * signs
     moved_px = np.linalg.norm(state[:, :2], axis=1)
     good = settled & (freedom > 24) & (moved_px < farthest_px) & (contrast > 0.0)
-    found = Saddles(pixels_px + state[:, :2], sigma, wide_px(state), contrast, noise)
-    for values in found:
-        values[~good] = np.nan
-    return found
+    values = pixels_px + state[:, :2], sigma, wide_px(state), contrast, noise
+    for one in values:
+        one[~good] = np.nan
+    return Saddles(crossings.ids, *values)
 
 
 def _start(pixels: Pixels, signs: FloatArray, jacobians: FloatArray, wide: FloatArray) -> FloatArray:
