@@ -299,10 +299,7 @@ class ConfigRecord(Record):
 def load_config(path: str | Path | None = None) -> Config:
     """Read a configuration; without a path the packaged one, which runs the simulated rover.
 
-    Raises
-    ------
-    BadFile
-        If it cannot be read or used: which key, what it holds, and what is expected.
+    Raises BadFile with the key, its value, and what is expected.
     """
     file = default_config() if path is None else Path(path)
     return parse_config(read_bytes(file, _MAX_BYTES), file)
@@ -350,10 +347,7 @@ def parse_config(data: bytes, path: str | Path) -> Config:
 def check_cameras(config: Config, rig: Rig) -> None:
     """Pass a configuration whose cameras, and pairs to track with, the mast file knows.
 
-    Raises
-    ------
-    BadFile
-        Naming the camera or pair, and the nearest one that the mast file has.
+    Raises BadFile with the camera or pair, and the nearest one that the mast file has.
     """
     for pair in config.tracking.handoff.pairs:
         if pair not in rig.stereo:
@@ -384,10 +378,7 @@ def _known(word: str, known: tuple[str, ...]) -> str:
 def parse_address(text: str) -> Listen:
     """Read ``HOST:PORT``, ``[HOST]:PORT`` or the path of a Unix socket, which has a slash in it.
 
-    Raises
-    ------
-    ValueError
-        In reason that say what is expected.
+    Raises ValueError.
     """
     if "/" in text:
         if len(os.fsencode(text)) > LONGEST_SOCKET_PATH:

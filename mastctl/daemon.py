@@ -1,8 +1,8 @@
 """The daemon: a socket, a service, a web server, and an orderly end.
 
-Its life is: take the address, open the service, serve, and on the way out stop the mast before anything else.
-Whatever hangs on the way out is left behind after some seconds, and said. Every signal that would end the
-process ends it this way.
+It takes the address, opens the service, serves, and at its end stops the mast before anything else. A part
+that hangs at the end is left behind after some seconds, and logged. Every signal that would end the process
+ends it so.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 
@@ -89,9 +90,8 @@ def run(
 
             def ready(_: Callable[[], None]) -> None:
                 on_ready(url)
-                threading.Thread(target=_load_ahead, name="loading", daemon=True).start()
-                if draws_ahead:
-                    _draw_ahead(service)
+                prepare = partial(_prepare, service, draws_ahead)
+                threading.Thread(target=prepare, name="first pointing", daemon=True).start()
 
             asyncio.run(_serve(service, listener, ready, rules, in_process=True))
         finally:
@@ -103,16 +103,12 @@ class RunningDaemon:
 
     def __init__(self, config: Config, clock: Clock | None = None) -> None:
         self._exit = contextlib.ExitStack()
-        listener, self.url = self._exit.enter_context(_listening(config.listen))
         try:
+            listener, self.url = self._exit.enter_context(_listening(config.listen))
             named = config.state_folder  # the program's own, whatever unit it runs in
             folder = None if named is None else StateFolder.of(named, config.path, self.url)
             self.service = _opened(config, clock, folder, self.url)
-        except BaseException:
-            self._exit.close()
-            raise
-        self._exit.callback(self.service.close)
-        try:
+            self._exit.callback(self.service.close)
             self._entrance = _entry_rules(self.service, self.url)
         except BaseException:
             self._exit.close()
@@ -173,7 +169,7 @@ class RunningDaemon:
 
 
 def _state_folder(config: Config) -> StateFolder:
-    """The folder of a daemon's own process; at any free port nobody would find it again, if none is named."""
+    """The folder of a daemon's own process; a temporary one at any free port, where it is not found again."""
     if config.listen.socket is None and config.listen.port == 0:
         return StateFolder.named(config.state_folder) or StateFolder.temporary()
     return StateFolder.of(config.state_folder, config.path, config.listen.url)
@@ -199,20 +195,17 @@ def _opened(config: Config, clock: Clock | None, folder: StateFolder | None, url
     return service
 
 
-def _load_ahead() -> None:
-    """Load what a pointing's first look needs, and neither an answer nor a stop does: it takes a moment."""
+def _prepare(service: Service, draws_ahead: bool) -> None:
+    """Load the modules of a first pointing, and have a simulated rover draw its first pictures."""
     from scipy import ndimage, special  # noqa: F401
 
-
-def _draw_ahead(service: Service) -> None:
-    """Have a simulated rover draw what its cameras see where it stands, beside everything else."""
-    rover, now_s = service.hardware.simulation, service.clock.now_s()
-    if rover is not None:
-        threading.Thread(target=rover.draw_ahead, args=(now_s,), name="first pictures", daemon=True).start()
+    rover = service.hardware.simulation
+    if rover is not None and draws_ahead:
+        rover.draw_ahead(service.clock.now_s())
 
 
 def _let_log_stall(service: Service) -> None:
-    """Let a fault of a simulated rover hold what this process says, as a pipe that nobody reads does."""
+    """Let a fault of a simulated rover delay this process' log, as an unread pipe does."""
     rover, clock = service.hardware.simulation, service.clock
     if rover is not None:
         stall_while(lambda: rover.faults.find(LOG, "stalled", clock.now_s()) is not None)
@@ -226,7 +219,7 @@ async def _serve(
     *,
     in_process: bool,
 ) -> None:
-    """Serve until told to stop; ``on_ready`` gets a function that tells it so, from any thread.
+    """Serve until the end is requested; ``on_ready`` gets a function that requests it, from any thread.
 
     With a process of its own the signals are the daemon's, and the service is closed under their rule too.
     """
@@ -262,7 +255,7 @@ async def _serve(
     serving = asyncio.create_task(server.serve(sockets=[listener]))
     while not server.started and not serving.done():
         await asyncio.sleep(0.005)
-    if serving.done():  # nobody is told an address that does not answer; the caller closes the service
+    if serving.done():  # an address that does not answer is not announced; the caller closes the service
         await serving
         raise MastctlError("the web server ended before it answered a request")
     listener.listen(WAITING_IN_KERNEL)  # asyncio has one number for this and for how many it takes at once
@@ -272,8 +265,7 @@ async def _serve(
     if in_process:
         for number, handler in handlers.items():  # uvicorn has set its own: the mast is stopped first
             signal.signal(number, handler)
-        # What the start has made stays. Looked through again by each full collection it held every thread for
-        # some 80 ms, a stop's too.
+        # Objects of the start stay. Each full collection of them stopped every thread for some 80 ms.
         gc.collect()
         gc.freeze()
     on_ready(end_from_anywhere)
@@ -285,7 +277,7 @@ async def _serve(
     try:
         stopped = asyncio.wrap_future(service.stop_threads.submit(service.operations.close))
     except StopsHang:
-        stopped = loop.run_in_executor(None, service.operations.close)
+        stopped = asyncio.ensure_future(asyncio.to_thread(service.operations.close))
     waiting.end()
     log.info("ending: the mast is stopped first")
     await stopped
@@ -296,7 +288,7 @@ async def _serve(
     for task in beside:
         task.cancel()
     if in_process:
-        await loop.run_in_executor(None, service.close)
+        await asyncio.to_thread(service.close)
 
 
 async def _reread_tokens(access: Access, waiting: Waiting, streams: Streams) -> None:
@@ -356,9 +348,9 @@ def _entry_rules(service: Service, url: str) -> EntryRules:
 
 
 def _suspend(service: Service) -> None:
-    """Stop the mast, then let the process be suspended: nobody would watch a head under way."""
+    """Stop the mast, then let the process be suspended: a suspended one watches no head under way."""
 
-    def then(stopped: Future[str | None]) -> None:
+    def suspend(stopped: Future[str | None]) -> None:
         error = stopped.exception()
         if error is None:
             os.kill(os.getpid(), signal.SIGSTOP)
@@ -366,14 +358,14 @@ def _suspend(service: Service) -> None:
             log.error("not suspended: the stop failed and the head may still move: %s", error)
 
     try:
-        service.stop_threads.submit(service.stopping.stop).add_done_callback(then)
+        service.stop_threads.submit(service.stopping.stop).add_done_callback(suspend)
     except StopsHang as error:
         log.error("not suspended: the head could not be stopped and may still move: %s", error)
 
 
 @contextlib.contextmanager
 def _listening(listen: Listen) -> Iterator[tuple[socket.socket, str]]:
-    """Hold the socket, and say the address as it is (port 0 has become a number)."""
+    """Listen; yield the socket, and the address as it is (port 0 has become a number)."""
     if listen.socket is not None:
         listener = _unix_socket(listen.socket)
         url = listen.url
@@ -421,7 +413,7 @@ def _unix_socket(path: Path) -> socket.socket:
 
 
 def _answers(path: Path) -> bool:
-    """Whether somebody listens at a Unix socket."""
+    """Whether a program listens at a Unix socket."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         try:
             probe.connect(str(path))

@@ -1,6 +1,6 @@
 """Errors of the service: programs read ``code``, people read the message, one plain sentence.
 
-A family says what its caller can do; the code says what it is about. An error has a class of its own where
+A family says what its caller can do; the code names the subject. An error has a class of its own where
 code catches it, or where it carries more than a code.
 """
 
@@ -26,15 +26,7 @@ class MastctlError(Exception):
 
 
 class _Family(MastctlError):
-    """Errors that a caller meets in one way, told apart by their code.
-
-    Parameters
-    ----------
-    code
-        What programs read; a row of the table in docs/reference/http.md.
-    message
-        One plain sentence.
-    """
+    """Errors that a caller treats alike; their ``code`` is a row of the table in docs/reference/http.md."""
 
     def __init__(self, code: str, message: str) -> None:
         self.code = code
@@ -66,7 +58,7 @@ class NotNow(_Family):
 
 
 class Unable(_Family):
-    """The service cannot do it for any client; ask again after ``retry_after_s`` seconds."""
+    """The service cannot do it for any client; it may be requested again after ``retry_after_s`` seconds."""
 
     def __init__(self, code: str, message: str, retry_after_s: float | None = None) -> None:
         self.retry_after_s = retry_after_s
@@ -81,15 +73,15 @@ class Stopped(NotNow):
 
 
 def one_line(text: object, longest: int) -> str:
-    """Return what was said outside as one printable line, cut to ``longest`` signs; never raises.
+    """Return a text from outside as one printable line, cut to ``longest`` signs; never raises.
 
-    What a terminal obeys or JSON cannot hold becomes ``?``. What has no words is an empty line.
+    Control characters, and those that JSON cannot contain, become ``?``.
     """
     try:
-        words = " ".join(str(text).split())
-    except BaseException:  # an exception of a driver from outside may raise where it is to say what it is
+        line = " ".join(str(text).split())
+    except BaseException:  # an exception of a driver from outside may raise where it describes itself
         return ""
-    return "".join(sign if sign.isprintable() else "?" for sign in words[:longest])
+    return "".join(sign if sign.isprintable() else "?" for sign in line[:longest])
 
 
 def error_body(error: BaseException) -> dict[str, Any]:
@@ -103,8 +95,8 @@ def error_body(error: BaseException) -> dict[str, Any]:
                 "message": one_line(str(error), LONGEST_MESSAGE),
                 "detail": as_json(detail) if isinstance(detail, Mapping) else None,
             }
-    except Exception:  # a driver from outside raised what cannot even be put into words
-        log.debug("an error without words", exc_info=True)
+    except Exception:  # of a driver from outside
+        log.debug("an error that cannot be described", exc_info=True)
     return {
         "code": "internal",
         "message": f"the service met a defect of its own ({type(error).__name__}); its log says more",

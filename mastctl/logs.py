@@ -1,8 +1,8 @@
-"""Logs that never hold whoever says them: how a record becomes a line, and a thread that writes it.
+"""Logs that never delay their callers: how a record becomes a line, and a thread that writes it.
 
-A pipe that nobody reads, a terminal that was stopped, or a disk that hangs holds a process in its next write,
-and with it everybody who waits for a lock of the writer. Here only the writing thread is held. What does
-not fit into the queue meanwhile is dropped and counted, and the count is told when the output flows again.
+An unread pipe, a stopped terminal or a disk that hangs blocks a process in its next write, and with it every
+thread that waits for a lock of the writer. Of this module only the writing thread is blocked. Messages that
+do not fit into the queue meanwhile are dropped and counted; the count is logged when the output flows again.
 """
 
 from __future__ import annotations
@@ -32,10 +32,7 @@ _PRIORITIES = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), 
 class JsonLines(logging.Formatter):
     """One JSON object a line: ``time`` (UTC), ``level``, ``logger``, ``message``, ``traceback``.
 
-    Parameters
-    ----------
-    priorities
-        Whether each line begins with its priority as journald reads it.
+    With ``priorities`` each line begins with its priority as journald reads it.
     """
 
     def __init__(self, *, priorities: bool = False) -> None:
@@ -45,15 +42,15 @@ class JsonLines(logging.Formatter):
     def format(self, record: logging.LogRecord) -> str:
         """Return the record as one line."""
         seconds = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
-        told = {
+        fields = {
             "time": f"{seconds}.{int(record.msecs):03d}Z",
             "level": record.levelname.lower(),
             "logger": record.name,
             "message": record.getMessage(),
         }
         if record.exc_info:
-            told["traceback"] = self.formatException(record.exc_info)
-        line = json.dumps(told)
+            fields["traceback"] = self.formatException(record.exc_info)
+        line = json.dumps(fields)
         return f"<{_priority(record.levelno)}>{line}" if self._priorities else line
 
 
@@ -62,7 +59,7 @@ def _priority(level: int) -> int:
 
 
 def to_journal(descriptor: int, environ: Mapping[str, str] = os.environ) -> bool:
-    """Return whether what is written to a descriptor goes to journald (systemd.exec(5), JOURNAL_STREAM)."""
+    """Return whether a descriptor leads to journald (systemd.exec(5), JOURNAL_STREAM)."""
     device, _, inode = environ.get("JOURNAL_STREAM", "").partition(":")
     try:
         about = os.fstat(descriptor)
@@ -72,7 +69,7 @@ def to_journal(descriptor: int, environ: Mapping[str, str] = os.environ) -> bool
 
 
 def formatter(wanted: LogFormat | None, descriptor: int | None = None) -> logging.Formatter:
-    """Return what makes lines for a descriptor, stderr by default; JSON unasked where it goes to journald."""
+    """Return the formatter for a descriptor, stderr by default; JSON by default where that is journald."""
     journal = to_journal(sys.stderr.fileno() if descriptor is None else descriptor)
     if wanted == "json" or (wanted is None and journal):
         return JsonLines(priorities=journal)
@@ -82,7 +79,7 @@ def formatter(wanted: LogFormat | None, descriptor: int | None = None) -> loggin
 KEPT = 1000  # messages that wait for an output that does not flow
 FLUSH_S = 1.0
 
-STALLED_LOOK_S = 0.05
+STALLED_S = 0.05
 
 Message = str | Callable[[], str]
 
@@ -90,24 +87,14 @@ _stalls: list[Callable[[], bool]] = []
 
 
 def stall_while(stalled: Callable[[], bool]) -> None:
-    """Have outputs of this process behave as if nobody read them, while the function given last says so."""
+    """Have outputs of this process behave as if unread, while the function given last returns true."""
     _stalls[:] = [stalled]
 
 
 class QueuedWriter:
-    """Writes text to a file descriptor, in the order given, from a thread of its own.
+    """Writes text to a file descriptor, in the order given, from a thread of its own; ``kept`` may wait.
 
-    Parameters
-    ----------
-    descriptor
-        Where to; not closed.
-    kept
-        How many messages may wait.
-
-    Attributes
-    ----------
-    own_line
-        Makes a line of what the writer itself has to say.
+    ``own_line`` makes a line of a message of the writer itself.
     """
 
     def __init__(self, descriptor: int, kept: int = KEPT) -> None:
@@ -115,28 +102,28 @@ class QueuedWriter:
         self._kept = kept
         self._queue: SimpleQueue[Message | threading.Event] = SimpleQueue()
         self._dropped = 0
-        self.own_line: Callable[[str], str] = lambda words: f"mastctl: {words}\n"
-        # Reentrant, because a signal's handler or a finaliser may say something in the middle of it.
+        self.own_line: Callable[[str], str] = lambda message: f"mastctl: {message}\n"
+        # Reentrant, because a signal's handler or a finaliser may log in the middle of it.
         self._counting = threading.RLock()
         threading.Thread(target=self._work, name="output", daemon=True).start()
 
     def put(self, message: Message) -> None:
-        """Have a text written, or what a function returns, which is called in the writing thread; at once."""
+        """Have a text written, or a function's result, made in the writing thread; returns at once."""
         if self._queue.qsize() >= self._kept:
             with self._counting:
                 self._dropped += 1
             return
         if self._dropped:
-            self._queue.put(self._told_dropped)
+            self._queue.put(self._dropped_line)
         self._queue.put(message)
 
     def flush(self, timeout_s: float = FLUSH_S) -> bool:
-        """Wait until what was put before is written, ``timeout_s`` seconds at most; return whether it is."""
+        """Wait until all of before is written, ``timeout_s`` seconds at most; return whether it is."""
         written = threading.Event()
         self._queue.put(written)
         return written.wait(timeout_s)
 
-    def _told_dropped(self) -> str:
+    def _dropped_line(self) -> str:
         with self._counting:
             dropped, self._dropped = self._dropped, 0
         if not dropped:
@@ -151,23 +138,23 @@ class QueuedWriter:
             if not isinstance(entry, threading.Event):
                 self._write(entry)
             if self._dropped and self._queue.empty():
-                self._write(self._told_dropped)
+                self._write(self._dropped_line)
             if isinstance(entry, threading.Event):
                 entry.set()
 
     def _write(self, message: Message) -> None:
-        """Write one message whole; what cannot be written at all (closed, disk full) is lost."""
+        """Write one message whole; it is lost where nothing can be written (closed, disk full)."""
         try:
             text = message if isinstance(message, str) else message()
-        except Exception as error:  # a message that cannot be put into words must not end the thread
+        except Exception as error:  # of its formatting, which must not end the thread
             text = self.own_line(f"a message could not be put into words: {type(error).__name__}")
         left = text.encode("utf-8", "backslashreplace")
         while left:
             while any(stalled() for stalled in _stalls):
-                time.sleep(STALLED_LOOK_S)
+                time.sleep(STALLED_S)
             try:
                 left = left[os.write(self.descriptor, left) :]
-            except BlockingIOError:  # whoever started us shares the pipe and does not wait on it
+            except BlockingIOError:  # the process that started this one shares the pipe, without waiting
                 with contextlib.suppress(OSError):
                     select.select([], [self.descriptor], [])
             except OSError:
@@ -176,7 +163,7 @@ class QueuedWriter:
 
 @cache
 def writer_to(descriptor: int) -> QueuedWriter:
-    """Return the one writer to a descriptor, so that what several say stays in order."""
+    """Return the one writer to a descriptor, which keeps the messages of several callers in order."""
     return QueuedWriter(descriptor)
 
 
@@ -214,19 +201,19 @@ class QueuedHandler(logging.Handler):
         self._writer = writer
 
     def setFormatter(self, fmt: logging.Formatter | None) -> None:
-        """Format records, and what the writer itself has to say, by this."""
+        """Format records, and messages of the writer itself, by this."""
         super().setFormatter(fmt)
         if fmt is not None:
             about = {"name": "mastctl", "levelno": logging.WARNING, "levelname": "WARNING"}
-            self._writer.own_line = lambda words: (
-                fmt.format(logging.makeLogRecord({**about, "msg": "%s", "args": (words,)})) + "\n"
+            self._writer.own_line = lambda message: (
+                fmt.format(logging.makeLogRecord({**about, "msg": "%s", "args": (message,)})) + "\n"
             )
 
     def createLock(self) -> None:
         self.lock = None
 
     def handle(self, record: logging.LogRecord) -> bool:
-        """Emit a record that the filters pass; the library's own way takes the lock (3.13: unasked)."""
+        """Emit a record that the filters pass; the library's own method takes the lock."""
         passed = self.filter(record)
         if passed:
             self.emit(passed if isinstance(passed, logging.LogRecord) else record)
@@ -236,5 +223,5 @@ class QueuedHandler(logging.Handler):
         self._writer.put(lambda: self.format(record) + "\n")
 
     def flush(self) -> None:
-        """Wait for what was logged, a second at most."""
+        """Wait for the records of before, a second at most."""
         self._writer.flush()

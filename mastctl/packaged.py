@@ -15,10 +15,7 @@ NAMES_SCHEMA = "# yaml-language-server: $schema="
 def config_folder() -> Path:
     """Return the folder of packaged configurations: inside the installed package, or beside it in a checkout.
 
-    Raises
-    ------
-    FileNotFoundError
-        If neither exists, which means a damaged installation.
+    Raises FileNotFoundError for a damaged installation.
     """
     package = Path(__file__).resolve().parent
     candidates = (package / "configs", package.parent / "configs")
@@ -50,10 +47,7 @@ def schema_files() -> dict[str, Path]:
 def name_schema(file: Path, kind: str) -> Path:
     """Let a YAML file's first line name its schema for editors; return that schema, put into a folder beside.
 
-    Raises
-    ------
-    BadFile
-        If the file system refuses.
+    Raises BadFile if the file system refuses.
     """
     from calib.files import replace_bytes
 

@@ -1,11 +1,11 @@
-"""What starts and watches this process, as systemd does: told when it is ready, how it is, and that it lives.
+"""The program that starts and watches this process, as systemd does: it gets readiness, state, life signs.
 
-The protocol (sd_notify(3)) is a line of text in a datagram to the socket that ``NOTIFY_SOCKET`` names. Where
-nobody asked, nothing is sent. Nothing here waits: a manager that reads nothing loses messages, no more.
+The protocol (sd_notify(3)) is a line of text in a datagram to the socket that ``NOTIFY_SOCKET`` names;
+without that nothing is sent. No call waits: a manager that reads nothing loses messages, no more.
 
-The watchdog is fed by what must not stand still, one after the other: a turn of the head's thread asks for
-it, and the event loop sends it. If either hangs nothing is sent, and the manager ends the process and runs
-what its unit names for that, which stops the head.
+The watchdog is fed by two threads one after the other: a turn of the head's thread requests it, and the event
+loop sends it. If either hangs nothing is sent, and the manager ends the process and runs the command that its
+unit names for that, which stops the head.
 """
 
 from __future__ import annotations
@@ -20,17 +20,9 @@ BEATS = 4  # messages in the time that the manager allows; it asks for two
 
 
 class ServiceManager:
-    """The manager of this process, or nobody.
+    """The manager of this process, or none, by ``NOTIFY_SOCKET``, ``WATCHDOG_USEC`` and ``WATCHDOG_PID``.
 
-    Parameters
-    ----------
-    environ
-        ``NOTIFY_SOCKET``, ``WATCHDOG_USEC`` and ``WATCHDOG_PID`` are read from it.
-
-    Attributes
-    ----------
-    watchdog_s
-        Seconds without a sign of life after which the manager acts; None if it does not watch.
+    ``watchdog_s``: seconds without a sign of life after which it acts; None if it does not watch.
     """
 
     def __init__(self, environ: Mapping[str, str] = os.environ) -> None:
@@ -44,15 +36,15 @@ class ServiceManager:
         self._socket.setblocking(False)
 
     def ready(self) -> None:
-        """Say that requests are answered."""
+        """State that requests are answered."""
         self._send("READY=1")
 
     def reloading(self) -> None:
-        """Say that the configuration is read again; `ready` ends it."""
+        """State that the configuration is read again; `ready` ends it."""
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def stopping(self) -> None:
-        """Say that the process ends on purpose."""
+        """State that the process ends on purpose."""
         self._send("STOPPING=1")
 
     def alive(self) -> None:
@@ -60,7 +52,7 @@ class ServiceManager:
         self._send("WATCHDOG=1")
 
     def status(self, sentence: str) -> None:
-        """Say how things are, in one line, as ``systemctl status`` shows it."""
+        """State how the daemon is, in one line, as ``systemctl status`` shows it."""
         self._send(f"STATUS={' '.join(sentence.split())}")
 
     def close(self) -> None:
@@ -71,21 +63,14 @@ class ServiceManager:
 
     def _send(self, text: str) -> None:
         if self._socket is not None:
-            with contextlib.suppress(OSError):  # a manager that is gone, or reads nothing, holds nobody
+            with contextlib.suppress(OSError):  # a manager that is gone, or reads nothing
                 self._socket.sendto(text.encode(), self._address)
 
 
 class Heartbeat:
-    """Signs of life for a manager that watches; `turn` may come from any thread, as often as it likes.
+    """Signs of life for a manager that watches; `turn` may be called from any thread, at any rate.
 
-    Parameters
-    ----------
-    manager
-        Who is told; if it does not watch, nothing happens.
-    in_loop
-        Has a function called by the event loop, soon; may be called from any thread.
-    now_s
-        The machine's monotonic time, seconds.
+    ``in_loop`` has a function called by the event loop, soon, from any thread.
     """
 
     def __init__(
@@ -98,21 +83,21 @@ class Heartbeat:
         self._in_loop = in_loop
         self._now_s = now_s
         self._next_s = float("-inf")
-        self._asked = False  # the loop has not come to the last one yet: another would only pile up
+        self._requested = False  # the loop has not sent the last one yet
 
     def turn(self) -> None:
         """Take note that the calling thread goes on; waits for nothing."""
-        if self._manager.watchdog_s is None or self._asked or self._now_s() < self._next_s:
+        if self._manager.watchdog_s is None or self._requested or self._now_s() < self._next_s:
             return
         self._next_s = self._now_s() + self._manager.watchdog_s / BEATS
-        self._asked = True
+        self._requested = True
         try:
             self._in_loop(self._beat)
         except RuntimeError:  # the loop has ended: so does the process
-            self._asked = False
+            self._requested = False
 
     def _beat(self) -> None:
-        self._asked = False
+        self._requested = False
         self._manager.alive()
 
 

@@ -10,14 +10,13 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NoReturn
 
 # The program's own defects; after these nothing can be trusted to run.
 _DEFECTS = {
     signal.SIGSEGV, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGABRT, signal.SIGTRAP,
     signal.SIGSYS,
 }  # fmt: skip
-# Those that end nobody, or nobody can catch; Python ignores SIGPIPE and SIGXFSZ: there the write fails.
+# Those that end no process, or cannot be caught; Python ignores SIGPIPE and SIGXFSZ: there the write fails.
 _OTHERS = {
     signal.SIGCHLD, signal.SIGURG, signal.SIGWINCH, signal.SIGCONT, signal.SIGPIPE, signal.SIGXFSZ,
     signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU, signal.SIGKILL, signal.SIGSTOP,
@@ -28,7 +27,7 @@ ENDING: frozenset[int] = frozenset(map(int, signal.valid_signals() - _DEFECTS - 
 
 
 class Ended(KeyboardInterrupt):
-    """A signal asked for the end; ``number`` says which. Everything that heeds Ctrl-C heeds it too."""
+    """A signal requested the end. Every handler of Ctrl-C handles it too."""
 
     def __init__(self, number: int) -> None:
         self.number = number
@@ -57,7 +56,7 @@ def write_from_background() -> None:
 
 
 def wanted() -> tuple[int, ...]:
-    """Return the ending signals but those that whoever started us wants ignored, as nohup does SIGHUP."""
+    """Return the ending signals but those that the parent process wants ignored, as nohup does SIGHUP."""
     kept = {int(signal.SIGTERM), int(signal.SIGINT)}
     return tuple(n for n in sorted(ENDING) if n in kept or signal.getsignal(n) is not signal.SIG_IGN)
 
@@ -66,30 +65,26 @@ def wanted() -> tuple[int, ...]:
 def raised(*also: int) -> Iterator[None]:
     """Raise Ended in the main thread at the first ending signal inside the block; later ones do nothing.
 
-    SIGINT stays a KeyboardInterrupt each time, unless it is named in ``also``. Signals that somebody handles
-    or ignores already stay as they are.
+    SIGINT stays a KeyboardInterrupt each time, unless it is named in ``also``. Signals that are handled or
+    ignored already stay as they are.
     """
-    asked = False
+    requested = False
 
     def end(number: int, frame: object) -> None:
-        nonlocal asked
-        if not asked:
-            asked = True
-            _end(number)
+        nonlocal requested
+        if not requested:
+            requested = True
+            raise Ended(number)
 
     before = {n: signal.getsignal(n) for n in ENDING}
     ours = [n for n, handler in before.items() if handler is signal.SIG_DFL or n in also]
     try:
         for number in ours:
             signal.signal(number, end)
-    except ValueError:  # not the main thread: signals are somebody else's
+    except ValueError:  # not the main thread, which handles signals
         ours = []
     try:
         yield
     finally:
         for number in ours:
             signal.signal(number, before[number])
-
-
-def _end(number: int) -> NoReturn:
-    raise Ended(number)

@@ -338,17 +338,23 @@ class Service:
             self.devices.close,
             self.machine.publisher.close,
             self.metrics.close,
-            self.stop_threads.close,
             self.journals.close,
             self.recorder.close,
-            lambda: _bounded("closing the hardware", self.hardware.close, HARDWARE_CLOSE_S),
+            self._close_hardware,
+            self.stop_threads.close,
             *(one.close for one in maybe if one is not None),
         )
         with contextlib.ExitStack() as rest:  # none is skipped, whatever ends another one
             for close in reversed(first_to_last):
                 rest.callback(_tried, close)
 
-    # What the parts tell each other
+    def _close_hardware(self) -> None:
+        try:
+            self.stop_threads.submit(self.hardware.close).result(HARDWARE_CLOSE_S)
+        except TimeoutError:
+            log.error("closing the hardware did not end in %.0f s and is left behind", HARDWARE_CLOSE_S)
+
+    # Changes that one part makes in others
 
     def _own_faults(self) -> tuple[StandingFault, ...]:
         """What is wrong with the daemon's own files; takes no lock."""
@@ -470,19 +476,3 @@ def _run_names(hardware: Hardware, clock: Clock) -> Callable[[], str]:
         return random_run
     seeded = random.Random(simulation.settings.camera.seed)
     return lambda: f"{seeded.getrandbits(16):04x}"
-
-
-def _bounded(what: str, function: Callable[[], None], timeout_s: float) -> None:
-    """Run something that may hang or raise; go on after ``timeout_s`` seconds at the latest."""
-
-    def run() -> None:
-        try:
-            function()
-        except Exception:  # the last thing done with a driver; nothing is left to protect but the exit
-            log.exception("%s failed", what)
-
-    thread = threading.Thread(target=run, name=what, daemon=True)
-    thread.start()
-    thread.join(timeout_s)
-    if thread.is_alive():
-        log.error("%s did not end within %.0f s and is left behind", what, timeout_s)
