@@ -115,12 +115,6 @@ class AxisReport:
         """The angle that the counts leave: measured minus commanded."""
         return None if self.commanded_rad is None else self.measured_rad - self.commanded_rad
 
-    def left_px(self, focal_px: float) -> float | None:
-        """Return it in pixels at the image centre of a camera of focal length ``focal_px`` that looks at
-        right angles to the axis.
-        """
-        return None if self.left_rad is None else focal_px * math.tan(self.left_rad)
-
 
 COARSE_COUNT_RAD = math.tau / 4096
 """The counts assumed of a head that does not state its own: those of a 12-bit servo, the coarsest."""

@@ -154,8 +154,8 @@ class Devices(Cameras):
     ----------
     on_turn
         Called in the head's own thread each time it is about to read, whatever comes of that; must not wait.
-    temperatures_c
-        Of the axes, replaced and never edited.
+    reports
+        Where each axis was sent and is in counts; empty for a head that does not know. Never edited.
 
     Raises BadOptions if the head says that it speeds up faster than the limits allow.
     """
@@ -184,7 +184,7 @@ class Devices(Cameras):
         self._gate = threading.Lock()
         self._blocks: dict[object, Stopped] = {}  # why no move is let out, by holder
         self._closed = False
-        self.temperatures_c: Mapping[str, float] = {}
+        self.reports: Mapping[str, AxisReport] = {}
         self._reported_s: Mapping[str, float] = {}  # what the head reports about itself, and since when
         # The last move's ticket and when it was taken, until the head was read at rest after it.
         self._moved: tuple[int, float] | None = None
@@ -228,12 +228,11 @@ class Devices(Cameras):
             except DriverError:
                 raise error from None
 
-    def report(self) -> Mapping[str, AxisReport]:
-        """Return where each axis was sent and is in counts; empty for a head that does not know.
-
-        Raises DriverError if the head does not answer within 1 s, or something else.
-        """
-        return self._head.call("report", self._reported, READ_TIMEOUT_S, noted=False)
+    @property
+    def temperatures_c(self) -> Mapping[str, float]:
+        """Temperatures of the axes that report one."""
+        warm = {name: axis.temperature_C for name, axis in self.reports.items()}
+        return {name: value for name, value in warm.items() if is_number(value)}
 
     @property
     def reading_sigma_rad(self) -> Pair:
@@ -414,17 +413,8 @@ class Devices(Cameras):
         self.on_turn()
         moving = self._read_once().moving
         try:
-            axes = self._reported()
+            reports = dict(self._pan_tilt.report())
+            self.reports = {name: axis for name, axis in reports.items() if isinstance(axis, AxisReport)}
         except Exception:  # of a driver from outside; the reading is good all the same
-            axes = {}
-        warm = {name: axis.temperature_C for name, axis in axes.items()}
-        self.temperatures_c = {name: value for name, value in warm.items() if is_number(value)}
+            self.reports = {}
         return MOVING_PERIOD_S if moving else RESTING_PERIOD_S
-
-    def _reported(self) -> Mapping[str, AxisReport]:
-        reports = dict(self._pan_tilt.report())
-        for axis in reports.values():
-            if not isinstance(axis, AxisReport):
-                message = f"report returned {type(axis).__name__} where an AxisReport is expected"
-                raise BadReply(message, device=HEAD)
-        return reports

@@ -58,7 +58,7 @@ NOT_MEASURED: dict[str, Any] = {
 
 
 class PointingLoop(Steps):
-    """One request: points the head at its target, and measures how well it did. Parameters of `Steps`."""
+    """One request: points the head at its target, and measures how well it did."""
 
     _position_m: FloatArray | None = None
     _range_m: float | None = None
@@ -72,8 +72,7 @@ class PointingLoop(Steps):
     def run(self, request: PointRequest) -> PointingResult:
         """Carry out the request; blocks until it is done, at most the sum of its deadlines.
 
-        Raises PointingError: for everything that goes wrong on purpose: its code and one sentence, the step,
-        and the pointings done before. The mast was stopped.
+        Raises PointingError with the step and the pointings done before; the mast was stopped.
         """
         try:
             self._run(request)
@@ -308,7 +307,7 @@ class PointingLoop(Steps):
         self._range_m = best.range_m
         cameras = [name for name in (aim.camera, self.cameras.partner(aim.camera)) if name is not None]
         self.before(cameras, (best.pan_rad, best.tilt_rad), needed=(aim.camera,))
-        return self.go_to_true(best.pan_rad, best.tilt_rad, aim.camera)
+        return self.go_to_true(best.pan_rad, best.tilt_rad)
 
     def _solved(self, aim: Aim, aim_px: FloatArray, start: HeadReading, detail: dict[str, Any]) -> Solution:
         """Solve for the present position; return the solution that is taken from ``start``."""

@@ -23,6 +23,7 @@ from calib.matching.patch import MatchSettings, PatchMatch, match_patch
 from calib.matching.shown_view import FLOOR_RAD, Posed, ShownView, overlap, shown_view
 from calib.matching.warp import Plane, PosedImage, Relief, carry, facing_plane, grey
 from drivers.errors import BadFrame, DriverError
+from drivers.interfaces import AxisReport
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.keep_out import Pair
@@ -43,6 +44,8 @@ class DevicesLike(Protocol):
     def reading_sigma_rad(self) -> Pair: ...
     @property
     def counts_rad(self) -> Mapping[str, float]: ...
+    @property
+    def reports(self) -> Mapping[str, AxisReport]: ...
     def goal(self, true_rad: Pair, start: HeadReading, /) -> Pair: ...
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None: ...
     def stop(self) -> None: ...
@@ -129,8 +132,6 @@ class RigCameras:
         self, names: Sequence[str], after_s: float, resting: HeadReading, timeout_s: float | None = None
     ) -> dict[str, CameraView]:
         """Return frames exposed after a moment, by a head that rests where it was read.
-
-        ``timeout_s`` is that of the settings by default.
 
         Raises PointingError ``head_moving`` if the head moved in an exposure or is not where it rested;
         DriverError if a frame does not come, or cannot be used.
@@ -328,12 +329,8 @@ class RigCameras:
         """Find the clicked thing in the other camera too and check that both mean the same place.
 
         One camera alone would accept a shifted image. Compared is the place in the other one with where the
-        first one's ray leads there; a wrong joint angle turns both alike and does not show.
-
-        Returns
-        -------
-        match, detail
-            In the other camera, and the difference across and along the epipolar line.
+        first one's ray leads there; a wrong joint angle turns both alike and does not show. Returns the match
+        in the other camera, and the difference across and along the epipolar line.
 
         Raises PointingError ``eyes_disagree`` if the other camera does not confirm the place.
         """

@@ -35,28 +35,11 @@ DeadlineS = Annotated[float, Field(gt=0.0, le=LONGEST_DEADLINE_S, allow_inf_nan=
 class PointingError(MastctlError):
     """The request failed; the daemon stopped the mast.
 
-    The four verdicts of a search for the target that found none:
-
-    ``target_flat``: The image around the target has too little texture, or texture along one direction only.
-
-    ``target_ambiguous``: A second place in the image fits nearly as well as the target.
-
-    ``target_border``: The target lies at the border of an image or of the search window.
-
-    ``target_not_found``: No place in the search window fits the target: hidden, changed, or at another range.
-
-    Attributes
-    ----------
-    code
-        For programs. Own codes: ``stopped``, ``outside_image``, ``no_stereo``, ``head_fault``,
-        ``head_moving``, ``bad_reading``, ``no_fresh_frame``, ``did_not_arrive``, ``did_not_settle``,
-        ``not_in_view``, ``target_flat``, ``target_ambiguous``, ``target_border``, ``target_not_found``,
-        ``target_moving``, ``eyes_disagree``, ``off_the_line``, ``not_repeated``. That of a request that does
-        not fit, of a driver, of the limits or of the geometry passes through.
-    step
-        The step that failed.
-    result
-        The pointings done before it, None if there were none.
+    ``code`` is its own, or that of a request that does not fit, of a driver, limits or geometry. Of a search
+    for the target that found none: ``target_flat`` (the image around it has too little texture, or along one
+    direction only), ``target_ambiguous`` (a second place fits nearly as well), ``target_border`` (it lies at
+    the border of an image or of the search window), ``target_not_found`` (hidden, changed, or at another
+    range). ``step`` is the step that failed, ``result`` has the pointings done before it.
     """
 
     def __init__(self, code: str, message: str, step: str = "", result: PointingResult | None = None) -> None:
@@ -113,11 +96,7 @@ class Aim:
 
 
 class TrackRequest(StrictBody):
-    """``POST /track``: exactly one of pixel and position_m.
-
-    ``position_m`` is (3,), in the ``rover`` (default) or ``site`` frame; the two are one before the first
-    pose.
-    """
+    """``POST /track``: exactly one of pixel and position_m, (3,) in the ``rover`` (default) or ``site``."""
 
     deadline_s: DeadlineS | None = None
     pixel: PixelTarget | None = None
@@ -216,9 +195,7 @@ def aim_of(request: PointRequest, rig: Rig) -> Aim:
 
 
 def clicked_frame(target: PixelTarget, rig: Rig, find: Callable[[str], StampedFrame]) -> StampedFrame:
-    """Return the frame that was clicked in, if its camera, the pixel and its moment serve.
-
-    ``find`` returns a kept frame by its id. ``rig`` has the cameras that are configured.
+    """Return the frame that was clicked in, by ``find``, if its camera, the pixel and its moment serve.
 
     Raises NotKnown, BadRequest, NotNow ``unknown_camera``, ``wrong_camera``, ``outside_image``,
     ``frame_moving``; whatever ``find`` raises.

@@ -28,7 +28,7 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import stereo_range_error_m
 from calib.matching.handoff import MatchedHandoff, RefineSettings, matched_handoff, refine_handoff
-from calib.matching.look import TrackLook, seen_by
+from calib.matching.look import seen_by
 from calib.matching.patch import PatchMatch
 from calib.matching.track import Track, start_track
 from drivers.clock import Clock
@@ -115,28 +115,24 @@ class TargetSearch(Steps):
         self._tracking = settings
 
     def begin_at_pixel(self, target: PixelTarget) -> tuple[Track, TrackSighting]:
-        """Begin with a pixel of a named frame, found again in a fresh pair.
-
-        Raises MastctlError, DriverError.
-        """
+        """Begin with a pixel of a named frame, found again in a fresh pair. Raises as `clicked`."""
         found = self.clicked(target)
         assert found.other is not None  # a track's pixel is of a pair: `check_pair`
-        track = self._started(found.now, found.other, found.pixel_px, found.resting)
         pair = next(name for name, both in self._rig.stereo.items() if target.camera in both)
-        return track, self._first(pair, track, found.now, found.other, found.pixel_px)
+        return self._began(pair, found.now, found.other, found.pixel_px, found.resting)
 
     def begin_at_position(self, position_m: FloatArray) -> tuple[Track, TrackSighting]:
         """Begin with what is seen at a position (3,) of the rover frame.
 
-        Raises NotTrackable, PointingError, Unreachable, OutsideLimits, DriverError if nothing there can be
-        followed, or what is seen there is elsewhere.
+        Raises NotTrackable if nothing there can be followed, or what is seen there is elsewhere;
+        MastctlError, CalibError, DriverError.
         """
         choice = self._choices(position_m)[0]
         settled = self._pointed(choice)
         left, right = self._rig.stereo[choice.pair]
         views = self.capture((left, right), settled)
         pixel = np.asarray(views[left].camera.project(position_m)[0])
-        track = self._started(views[left], views[right], pixel, settled)
+        track, seen = self._began(choice.pair, views[left], views[right], pixel, settled)
         off_m = float(np.linalg.norm(track.position_m - position_m))
         allowed_m = self._tracking.start_error * choice.range_m
         if off_m > allowed_m:
@@ -145,16 +141,14 @@ class TargetSearch(Steps):
                 f"the surface that {left} sees in the direction of the position is at ({place}) m, "
                 f"{off_m:.2f} m from it; at most {allowed_m:.2f} m is expected"
             )
-        return track, self._first(choice.pair, track, views[left], views[right], pixel)
+        return track, seen
 
     def find(self, track: Track, found_by: str = "") -> tuple[Track, TrackSighting]:
         """Point, take a pair, search; with the next pair if the first does not find it.
 
         ``found_by`` is the pair that found the target last. If another one should serve now, that one is
-        first, as long as it sees the place, so that both pairs' images are of one pose of the rover.
-
-        Raises PointingError, OutsideLimits, DriverError if the head fails, or goes where it was not sent.
-        That no image comes is a look without success.
+        first, as long as it sees the place, so that both pairs' images are of one pose of the rover. That no
+        image comes is a look without success. Raises MastctlError, DriverError if the head fails.
         """
         choices = self._choices(track.position_m)
         first: _Sight | None = None
@@ -217,33 +211,29 @@ class TargetSearch(Steps):
                 pixels[name] = _pixel(
                     frame_id, match.verdict, match.reason, at, sigma, float(match.correlation)
                 )
-            seen = self._sighting(taken.choice, look, pixels, taken.settled)
+            pair, position_m, reason = taken.choice.pair, look.track.position_m, look.reason
+            if look.track.state == "lost" and taken.missing:
+                reason = "; ".join([*taken.missing.values(), *([reason] if look.found else [])])
+            joints = taken.settled.true_rad
+            cameras = (self._rig.camera_in_rover(name, *joints) for name in self._rig.stereo[pair])
+            range_m = _range_m(position_m, *cameras)
+            seen = TrackSighting(
+                look.track.state,
+                reason,
+                pair,
+                position_m,
+                range_m,
+                pixels,
+                look.chi2,
+                look.renewed,
+                look.doubt,
+            )
             detail.update(
                 pair=seen.pair, state=seen.state, reason=seen.reason, position_m=rounded(seen.position_m, 5)
             )
             if seen.pose_doubt:
                 detail.update(pose_doubt=seen.pose_doubt)
         return _Sight(look.track, seen, taken, look.found)
-
-    def _sighting(
-        self, choice: PairChoice, look: TrackLook, pixels: Mapping[str, CameraPixel], settled: HeadReading
-    ) -> TrackSighting:
-        track, reason = look.track, look.reason
-        gone = [one["reason"] for one in pixels.values() if one["verdict"] == "no_frame"]
-        if track.state == "lost" and gone:
-            reason = "; ".join([*gone, reason] if look.found else gone)
-        range_m = self._range_m(choice.pair, track.position_m, settled)
-        return TrackSighting(
-            track.state,
-            reason,
-            choice.pair,
-            track.position_m,
-            range_m,
-            pixels,
-            look.chi2,
-            look.renewed,
-            look.doubt,
-        )
 
     def _choices(self, position_m: FloatArray) -> list[PairChoice]:
         with self.step("choose") as detail:
@@ -265,11 +255,12 @@ class TargetSearch(Steps):
             return self.rest()
         cameras = self._rig.stereo[choice.pair]
         self.before(cameras, (choice.pan_rad, choice.tilt_rad), timeout_s=BEFORE_TIMEOUT_S)
-        return self.go_to_true(choice.pan_rad, choice.tilt_rad, cameras[0])[1]
+        return self.go_to_true(choice.pan_rad, choice.tilt_rad)[1]
 
-    def _started(
-        self, one: CameraView, other: CameraView, pixel_px: FloatArray, resting: HeadReading
-    ) -> Track:
+    def _began(
+        self, pair: str, one: CameraView, other: CameraView, pixel_px: FloatArray, resting: HeadReading
+    ) -> tuple[Track, TrackSighting]:
+        """Follow what a pixel shows; the other camera's pixel is where the triangulated point lies in it."""
         with self.step("start") as detail:
             detail.update(self.cameras.check_one_moment(one, pixel_px, [other], resting))
             try:
@@ -278,29 +269,18 @@ class TargetSearch(Steps):
                 raise NotTrackable(" ".join(str(error).split())) from None
             sigma_m = np.sqrt(np.diag(track.covariance_m2))
             detail.update(position_m=rounded(track.position_m, 5), sigma_m=rounded(sigma_m, 5))
-        return track
+        partner_px = np.asarray(other.camera.project(track.position_m)[0])
+        pixels = {
+            view.frame.camera: _pixel(view.frame.frame_id, "good", "", at)
+            for view, at in ((one, pixel_px), (other, partner_px))
+        }
+        range_m = _range_m(track.position_m, one.camera, other.camera)
+        return track, TrackSighting("tracked", "", pair, track.position_m, range_m, pixels)
 
-    def _first(
-        self, pair: str, track: Track, one: CameraView, other: CameraView, pixel_px: FloatArray
-    ) -> TrackSighting:
-        """What a start saw; the other camera's pixel is where the triangulated point lies in it."""
-        partner = np.asarray(other.camera.project(track.position_m)[0])
-        middle = (one.camera.C + other.camera.C) / 2
-        return TrackSighting(
-            "tracked",
-            "",
-            pair,
-            track.position_m,
-            float(np.linalg.norm(track.position_m - middle)),
-            {
-                view.frame.camera: _pixel(view.frame.frame_id, "good", "", at)
-                for view, at in ((one, pixel_px), (other, partner))
-            },
-        )
 
-    def _range_m(self, pair: str, position_m: FloatArray, settled: HeadReading) -> float:
-        left, right = (self._rig.camera_in_rover(name, *settled.true_rad) for name in self._rig.stereo[pair])
-        return float(np.linalg.norm(position_m - (left.C + right.C) / 2))
+def _range_m(position_m: FloatArray, left: CameraModel, right: CameraModel) -> float:
+    """From the middle between a pair's cameras."""
+    return float(np.linalg.norm(position_m - (left.C + right.C) / 2))
 
 
 def _pixel(
@@ -500,16 +480,10 @@ LEAST_ELLIPSE_PX = 0.05
 
 
 def in_picture(camera: CameraModel, position_m: ArrayLike, covariance_m2: object) -> dict[str, float] | None:
-    """Return the pixel of a point and one sigma of it as an ellipse.
+    """Return the pixel of a point (3,), in the camera's frame, and one sigma of it as an ellipse.
 
-    ``camera``: in the frame of the point; ``position_m``, ``covariance_m2``: (3,) metres and (3, 3) m²; None
-    for a point whose covariance is not known: then the ellipse is none.
-
-    Returns
-    -------
-    dict or None
-        ``x_px``, ``y_px``, ``major_px``, ``minor_px`` (half axes), ``turn_rad`` (of the major one, from x
-        towards y); None if the camera does not show the point.
+    ``x_px``, ``y_px``, the half axes ``major_px``, ``minor_px``, and ``turn_rad`` of the major one, from x
+    towards y; 0 where the covariance (3, 3) is not known. None if the camera does not show the point.
     """
     place, rates, valid = camera.project_jacobian(position_m)
     if not bool(valid) or not camera.holds(place):

@@ -11,13 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from calib.geometry.cahvor import CameraModel
 from calib.geometry.pointing import Solution, ordered
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.matching.patch import PatchMatch
 from drivers.clock import Clock
-from drivers.errors import DriverError
 from drivers.interfaces import AxisReport
 from mastctl.answers import Step
 from mastctl.devices.joint_history import HeadReading, RestWatch
@@ -44,18 +42,10 @@ REPEAT_SIGMAS = 3.0
 
 @dataclass(frozen=True, eq=False)
 class FoundAgain:
-    """A clicked thing, found again in new images.
+    """A pixel (2,) that was clicked in the named frame ``view``, found again in a new image ``now``.
 
-    Attributes
-    ----------
-    view, clicked_px
-        The named frame, and the pixel (2,) that was clicked in it.
-    now, other
-        New images of the clicked camera and of its partner; None where one camera points alone.
-    pixel_px, sigma_px
-        (2,) the thing in ``now``, and one sigma of either coordinate.
-    resting
-        The head while they were taken.
+    ``other`` is a new image of the camera's partner; None where one camera points alone. ``sigma_px`` is one
+    sigma of either coordinate of ``pixel_px``, (2,) in ``now``. The head was ``resting`` for both.
     """
 
     view: CameraView
@@ -75,27 +65,12 @@ class Steps:
     head is there at once). The head has settled when it rests (`RestWatch`); it has arrived when it rests
     where it was sent.
 
-    Parameters
-    ----------
-    rig
-        The part of the mast file in use that is configured.
-    limits
-        For the choice among solutions; ``devices`` checks them again, and knows what is kept out.
-    clock
-        The clock that stamps readings and frames.
-    record
-        Gets each step when it ends.
-    cancelled
-        Set by a stop; the request ends with PointingError ``stopped`` soon after.
+    ``rig`` is the configured part of the mast file in use; ``limits`` are for the choice among solutions,
+    ``devices`` checks them again. ``clock`` stamps readings and frames. ``record`` gets each step when it
+    ends. ``cancelled`` is set by a stop; the request ends with PointingError ``stopped`` soon after.
 
-    Attributes
-    ----------
-    last
-        The step that was begun last.
-    pointing
-        Which pointing of the request the next steps belong to; the record names the second and later ones.
-    motion_evidence
-        What the last images say about the move before them, by camera.
+    ``last`` is the step that was begun last, ``pointing`` the pointing of the request that the next steps
+    belong to, ``motion_evidence`` what the last images say about the move before them, by camera.
     """
 
     def __init__(
@@ -124,10 +99,9 @@ class Steps:
 
     @contextmanager
     def step(self, name: str) -> Iterator[dict[str, Any]]:
-        """Record what happens inside as one step; a request that was stopped does not begin it.
+        """Record what happens inside as one step, with the dict as its detail, and the error that ends it.
 
-        The dict becomes the step's detail. A failed step gets the error's code and message too, and the error
-        goes on.
+        A request that was stopped does not begin it.
         """
         self.last = name
         began_s = self._clock.now_s()
@@ -152,10 +126,7 @@ class Steps:
     # The head
 
     def read(self) -> HeadReading:
-        """Return a reading that can be true.
-
-        Raises PointingError ``bad_reading`` or ``head_fault``; DriverError if the head does not answer.
-        """
+        """Return a reading that can be true. Raises PointingError ``bad_reading``, ``head_fault``."""
         reading, before = self._devices.read(), self._last_reading
         if self._clock.now_s() - reading.time_s > self._settings.reading_age_s:
             reading = self._devices.read()  # a process without a processor meanwhile is no fault of the head
@@ -206,13 +177,11 @@ class Steps:
         return resting
 
     def chosen(self, solutions: Sequence[Solution], start: HeadReading) -> Solution:
-        """Return the one of several true joint angles that is taken from a start, of the closed form.
+        """Return the one of several true joint angles of the closed form that is taken from a start.
 
         Of those that no keep-out bars, upright ones first, then the nearest; an angle is taken whole turns
-        away too, where a cable lets the pan turn so far.
-
-        Raises Unreachable if none lies within the limits; KeptOut if keep-outs bar all that do; of the one
-        that would have been taken.
+        away too, where a cable lets the pan turn so far. Raises Unreachable if none lies within the limits;
+        KeptOut of the one that would have been taken, if keep-outs bar all that do.
         """
 
         def goal(one: Solution) -> Pair:
@@ -230,18 +199,15 @@ class Steps:
         assert refused is not None
         raise refused
 
-    def go_to_true(self, pan_rad: float, tilt_rad: float, camera: str) -> tuple[Pair, HeadReading]:
+    def go_to_true(self, pan_rad: float, tilt_rad: float) -> tuple[Pair, HeadReading]:
         """Go to true angles, as `go` does; return the readings that were commanded, and the arrival."""
         goal = self._devices.goal((pan_rad, tilt_rad), self.read())
-        return goal, self.go(*goal, camera)
+        return goal, self.go(*goal)
 
-    def go(self, pan_rad: float, tilt_rad: float, camera: str | None = None) -> HeadReading:
+    def go(self, pan_rad: float, tilt_rad: float) -> HeadReading:
         """Check the limits, move until the head reads the angles, wait until settled; return the reading.
 
-        Where the head knows its counts, the record says what these leave, in pixels of ``camera``.
-
-        Raises OutsideLimits, KeptOut, PointingError, Stopped, DriverError if the angles may not be commanded
-        or are not reached.
+        Raises OutsideLimits, KeptOut, PointingError, Stopped, DriverError.
         """
         with self.step("limits") as detail:
             detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad)
@@ -253,9 +219,9 @@ class Steps:
             self.send(pan_rad, tilt_rad)
         with self.step("settle") as detail:
             settled = self.arrived(pan_rad, tilt_rad, began_s + allowed_s)
-            model = None if camera is None else self._rig.cameras[camera].model
-            detail.update(_angles(settled), **counts_left(self._devices, settled.tilt_rad, model))
-            detail.update(count_rad=dict(self._devices.counts_rad))
+            detail.update(_angles(settled), count_rad=dict(self._devices.counts_rad))
+            if reports := self._devices.reports:
+                detail.update(counts={name: _counts(axis) for name, axis in reports.items()})
         return settled
 
     def check_goal(self, pan_rad: float, tilt_rad: float) -> None:
@@ -317,8 +283,7 @@ class Steps:
     def clicked(self, target: PixelTarget, alone: bool = False) -> FoundAgain:
         """Take a fresh pair, or the clicked camera's image ``alone``, and find in it what was clicked.
 
-        Raises MastctlError, DriverError if camera, frame or pixel do not fit (`clicked_frame`), or the thing
-        is not found.
+        Raises MastctlError, DriverError, as `clicked_frame` too.
         """
         view = self.cameras.view(clicked_frame(target, self._rig, self._devices.frame_by_id))
         pixel = np.array([target.x_px, target.y_px])
@@ -349,10 +314,7 @@ class Steps:
         """Take images to compare with after a move, where there are none yet and they will show something.
 
         ``goal_rad`` are the true angles that it leads to. A camera that gives none is left out, and named in
-        the record, unless it is ``needed``.
-
-        Raises PointingError, DriverError if a needed one gives none, or the head does not answer; nothing has
-        moved.
+        the record, unless it is ``needed``. Nothing has moved where it raises PointingError, DriverError.
         """
         lacking = self.cameras.lacking(cameras, self.read().true_rad, goal_rad)
         if not lacking:
@@ -371,8 +333,7 @@ class Steps:
     def capture(self, cameras: Sequence[str], settled: HeadReading) -> dict[str, CameraView]:
         """Take new images, exposed after the head had settled, that moved as the head did.
 
-        Raises PointingError, DriverError if none come; `BadFrame` if one shows another view than the joints
-        say.
+        Raises PointingError, DriverError; `BadFrame` if one shows another view than the joints say.
         """
         with self.step("look") as detail:
             views = self.cameras.new(cameras, settled.time_s, settled)
@@ -438,37 +399,10 @@ class Steps:
         return later, again
 
 
-def counts_left(devices: object, tilt_rad: float, model: CameraModel | None) -> dict[str, Any]:
-    """Return ``counts``: goal, measured count and what is left between both, by axis.
-
-    A head that fails to answer has ``counts_missing`` instead, which says why; one without ``report`` (see
-    `drivers.interfaces.PanTilt`) nothing.
-
-    ``tilt_rad``: where the head is: a pan turns the image of a head that looks up less; ``model``: the aiming
-    camera, for the pixels; None for joint angles alone.
-    """
-    report = getattr(devices, "report", None)
-    try:
-        axes: dict[str, AxisReport] = dict(report()) if report is not None else {}
-    except DriverError as error:
-        return {"counts_missing": str(error)}
-    counts: dict[str, dict[str, Any]] = {}
-    for name, axis in axes.items():
-        one: dict[str, Any] = {"goal_counts": axis.goal_counts, "measured_counts": axis.measured_counts}
-        counts[name] = one
-        one["came_from"] = axis.side
-        if axis.count_rad is not None:
-            one["count_rad"] = axis.count_rad
-        if axis.left_rad is None:
-            continue
-        one["left_rad"] = round(axis.left_rad, 7)
-        if model is not None:
-            # Yakimovsky and Cunningham (1978): the focal lengths of columns and rows
-            focal_px = model.focal_px[0 if name == "pan" else 1]
-            share = math.cos(tilt_rad) if name == "pan" else 1.0
-            left_px = axis.left_px(focal_px)
-            one["left_px"] = None if left_px is None else round(share * left_px, 3)
-    return {"counts": counts} if counts else {}
+def _counts(axis: AxisReport) -> dict[str, Any]:
+    """Where an axis was sent and is in its own counts, and what is left between, for the record."""
+    left_rad = None if axis.left_rad is None else round(axis.left_rad, 7)
+    return {"goal_counts": axis.goal_counts, "measured_counts": axis.measured_counts, "left_rad": left_rad}
 
 
 def _outside(value: float, one: float, other: float) -> float:

@@ -115,7 +115,7 @@ def test_gravity_decides_the_side(goal_rad: float, side: int) -> None:
     assert settings.approach_sign(goal_rad) == side
 
 
-def test_what_the_counts_leave_is_told_in_pixels() -> None:
+def test_the_report_says_what_the_counts_leave() -> None:
     bench = Bench()
     angle_rad = 100.25 * COUNT_RAD
     goal = bench.plan(angle_rad)
@@ -123,8 +123,7 @@ def test_what_the_counts_leave_is_told_in_pixels() -> None:
     report = bench.motion.report()
     assert report is not None
     assert report.measured_counts - 2048 == 100
-    # A quarter of a 12-bit count is 0.49 pixels at a focal length of 1280 pixels (facts, section 4).
-    assert report.left_px(1280.0) == pytest.approx(-0.49, abs=0.005)
+    assert report.left_rad == pytest.approx(-0.25 * 2 * math.pi / 4096)
     assert report.current_A == pytest.approx(10 * 0.00269)
     assert report.voltage_V == pytest.approx(12.1)
 

@@ -162,7 +162,6 @@ CALLS: dict[str, Callable[[Devices], Any]] = {
     "read": lambda devices: devices.read(),
     "move": lambda devices: devices.move(0.5, 0.5),
     "stop": lambda devices: devices.stop(),
-    "report": lambda devices: devices.report(),
 }
 HANGING = [
     *itertools.combinations(("read", "move", "stop"), 1),

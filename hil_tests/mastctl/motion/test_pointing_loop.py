@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
+from drivers.interfaces import AxisReport
 from hil_tests.mastctl.motion.pointing_world import (
     LIMITS,
     SIZE_PX,
@@ -170,6 +171,14 @@ def test_the_record_names_every_step_in_order_with_plain_numbers() -> None:
     assert all(step["duration_s"] >= 0.0 for step in steps)
     json.dumps([as_json(step) for step in steps])
     json.dumps(as_json(result), allow_nan=False)
+
+
+def test_the_record_has_the_counts_of_a_head_that_knows_them() -> None:
+    axis = AxisReport(0.1, 65, 0.0997, 64, 0.0982, "positive", None, None, None, None)
+    _, steps = run(World(reports={"pan": axis}), PointRequest(pan_rad=0.1, tilt_rad=-0.4))
+    assert steps[-1]["detail"]["counts"] == {
+        "pan": {"goal_counts": 65, "measured_counts": 64, "left_rad": pytest.approx(-0.0018)}
+    }
 
 
 def test_the_new_picture_is_exposed_after_the_head_has_settled() -> None:
