@@ -7,7 +7,6 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from mastctl import signals
 from mastctl.cli import output
 from mastctl.cli.options import command, one_of, option, positive_number
 from mastctl.cli.output import Answer, Shown, WrongUse
@@ -22,7 +21,7 @@ MARKS = {"passed": "ok", "failed": "FAILED", "skipped": "-"}
     "conform",
     option("[URL]", "a running daemon's address"),
     one_of(
-        option("--motion", "move the head without a question", default=None),
+        option("--motion", "move the head, also a real one", default=None),
         option("--no-motion", "only checks that move nothing", dest="motion", action="store_false"),
     ),
     option(
@@ -57,17 +56,13 @@ def _conform(args: argparse.Namespace) -> Answer:
 
 
 def _may_move(args: argparse.Namespace, checks: Sequence[Check], simulated: bool) -> bool:
-    """Whether the head may be moved: by the options, or by the answer at the terminal. Raises WrongUse."""
+    """Whether the head may be moved: a simulated one may, any other by the options. Raises WrongUse."""
     if args.motion is not None:
         return bool(args.motion)
-    if simulated or not any(check.moves for check in checks):
-        return True
-    question = f"the head at {args.url} will be moved by up to {args.reach:g} rad from its present pose"
-    if not signals.can_ask():
-        raise WrongUse(f"{question}: --motion allows it, --no-motion leaves those checks out")
-    sys.stderr.write(f"{question[0].upper()}{question[1:]}. Move it? [y/N] ")
-    sys.stderr.flush()
-    return sys.stdin.readline().strip().lower() in ("y", "yes")
+    if not simulated and any(check.moves for check in checks):
+        moved = f"the head at {args.url} would be moved by up to {args.reach:g} rad from its present pose"
+        raise WrongUse(f"{moved}: --motion allows it, --no-motion leaves those checks out")
+    return True
 
 
 def _chosen(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:

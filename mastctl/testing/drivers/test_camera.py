@@ -12,8 +12,7 @@ from typing import Any
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
 from drivers.interfaces import Camera
-from mastctl.conform.checks import NotTried, PromiseBroken, expect
-from mastctl.conform.settings_trial import settings_tried
+from mastctl.conform.checks import NotTried, PromiseBroken, expect, settings_tried
 from mastctl.devices import frames as frame_checks
 from mastctl.setup.camera_check import FRAME_TIMEOUT_S, GRACE_S, CameraCheck
 from mastctl.testing.drivers.calls import beside, call, ended
