@@ -25,7 +25,8 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
 from drivers.errors import BadOptions
 from drivers.sim import kernels
-from drivers.sim.scene import Scene, tiny_scene
+from drivers.sim.placed import SceneSettings
+from drivers.sim.scene import Scene, build_scene
 from drivers.sim.sensor import FrameExposure, Readout
 
 Float32 = NDArray[np.float32]
@@ -253,20 +254,14 @@ def camera_key(camera: CameraModel) -> tuple[object, ...]:
     return tuple(n.tobytes() if isinstance(n, np.ndarray) else n for n in numbers)
 
 
-def compile_renderer() -> None:
-    """Compile what building a scene and drawing it need, or load it from the disk cache.
+def compile_renderer(scene: Scene | None = None) -> None:
+    """Compile what drawing a scene needs, or load it from the disk cache; building one does so too.
 
-    Compiling takes some twenty seconds. Raises BadOptions if numba is not installed.
+    Compiling takes some twenty seconds.
     """
-    scene = tiny_scene()
-    camera = CameraModel(
-        kind="CAHV",
-        size_px=(8, 8),
-        C=np.array([0.0, 0.0, -1.5]),
-        A=np.array([1.0, 0.0, 0.0]),
-        H=np.array([3.5, 8.0, 0.0]),
-        V=np.array([3.5, 0.0, 8.0]),
-    )
+    scene = scene or build_scene(SceneSettings(rocks=1))
+    x, y, z = np.eye(3)
+    camera = CameraModel("CAHV", (8, 8), C=-1.5 * z, A=x, H=3.5 * x + 8.0 * y, V=3.5 * x + 8.0 * z)
     renderer = Renderer(scene, workers=1)
     image = renderer.image(camera, Rigid.identity(), samples=1)
     renderer.close()

@@ -109,7 +109,7 @@ class RoverModel:
         self._renderer = Renderer(self.scene)
         self._boards = BenchBoards(self._renderer.image, placed)
         # Before any camera is queried: a frame's deadline is no time for a compiler.
-        compile_renderer()
+        compile_renderer(self.scene)
         self._stills = Stills(self._boards.image)
         self._render_lock = threading.Lock()
         self._closing = threading.Event()

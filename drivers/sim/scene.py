@@ -151,20 +151,6 @@ def laid_out(
     return stones, rocks.scattered(settings.bricks, brick_rng, taken_m, ground_m)
 
 
-def tiny_scene() -> Scene:
-    """Return a level scene with one rock and next to no texture, made in no time: for compiling only."""
-    settings = SceneSettings(relief_m=0.0, rocks=1)
-    rng = np.random.default_rng(settings.seed)
-    sun = sun_direction(settings)
-    inner = make_grid(np.zeros((9, 9), dtype=np.float32), INNER_CELLS * INNER_CELL_M / 8)
-    stones = rocks.make_rocks(1, rng, partial(ground_z_m, inner))
-    broad = pyramid(shadows(inner, stones, sun), inner.cell_m)
-    detail = pyramid(gravel(rng, sun, 128), DETAIL_TEXEL_M)
-    surface = pyramid(stone(rng, 128), STONE_TEXEL_M)
-    world = kernels.World(inner, inner, stones, detail, broad, surface, sun)
-    return Scene(settings, world)
-
-
 def sun_direction(settings: SceneSettings) -> Float64:
     """Unit vector (3,) towards the sun, site frame."""
     azimuth, elevation = settings.sun_azimuth_rad, settings.sun_elevation_rad

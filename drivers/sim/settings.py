@@ -23,8 +23,8 @@ from drivers.sim.placed import SceneSettings
 from drivers.simulation_clock import simulation_speed
 
 STEP_K = 1 / 16
-"""Temperatures are taken in such steps, since every other camera model costs the renderer a table of rays: at
-the default coefficients a step moves a picture's corner by 0.006 px."""
+"""Of temperatures, since every other camera model costs the renderer a table of rays: at the default
+coefficients a step moves a picture's corner by 0.006 px."""
 
 
 class LensSettings(DriverOptions):
@@ -39,9 +39,7 @@ class LensSettings(DriverOptions):
     pitch_um: Annotated[float, Field(ge=0.5, le=50.0)] = 12.0
     """From pixel to pixel; with a model's focal length in pixels it makes that in metres."""
     dust: Annotated[int, Field(ge=0, le=500)] = 0
-    """Specks on the window."""
     dust_um: Annotated[float, Field(ge=1.0, le=1000.0)] = 60.0
-    """Their diameter."""
     dust_gap_um: Annotated[float, Field(ge=0.0, le=10_000.0)] = 1000.0
     """From the window to the pixels."""
 
@@ -53,30 +51,24 @@ class ExposureSettings(DriverOptions):
     """The exposure time that gives the scene its own brightness, at gain 1; grey levels grow with time and
     gain. 0: they do not."""
     gain: Annotated[float, Field(ge=1.0, le=64.0)] = 1.0
-    """At the start."""
     auto: bool = False
     """Whether the camera sets time and gain itself, from ``exposure_s`` on."""
     target_dn: Annotated[float, Field(ge=10.0, le=245.0)] = 110.0
-    """The grey level that it aims at."""
     share: Annotated[float, Field(ge=0.01, le=1.0)] = 0.5
     """Of the way there, in its logarithm, that a frame's decision goes."""
     lag_frames: Annotated[int, Field(ge=1, le=8)] = 2
     """From the frame that is metered to the first one with what was decided."""
     shortest_s: Annotated[float, Field(ge=1e-6, le=10.0)] = 0.0001
-    """The shortest time."""
     longest_s: Annotated[float, Field(ge=0.0, le=1e3)] = 0.03
-    """The longest time; gain rises where it is too short."""
+    """Gain rises where this is too short."""
     most_gain: Annotated[float, Field(ge=1.0, le=64.0)] = 8.0
-    """The highest gain."""
 
 
 class CameraSettings(DriverOptions):
     """How a simulated camera takes pictures."""
 
     rate_hz: Annotated[float, Field(gt=0.0, le=1e4)] = 10.0
-    """Frames a second."""
     exposure_s: Annotated[float, Field(gt=0.0, le=1e3)] = 0.008
-    """Exposure time."""
     readout_s: Annotated[float, Field(ge=0.0, le=1e3)] = 0.02
     """From the end of an exposure until the frame can be had."""
     read_noise_dn: Annotated[float, Field(ge=0.0, le=255.0)] = 1.0
@@ -86,8 +78,7 @@ class CameraSettings(DriverOptions):
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 1
     """Of the noise; with the camera's name and the sequence number it fixes every pixel."""
     smear: bool = False
-    """Whether what moves during an exposure is drawn as often as it takes for views less than a pixel
-    apart."""
+    """Whether what moves during an exposure is drawn in views less than a pixel apart."""
     row_time_s: Annotated[float, Field(ge=0.0, le=0.001)] = 0.0
     """Rolling shutter: from the exposure of one row to that of the next; 0: all rows at once."""
     colour: bool = False
@@ -95,9 +86,7 @@ class CameraSettings(DriverOptions):
     jpeg_quality: Annotated[int, Field(ge=0, le=100)] = 0
     """Of the frames as they come, 1 to 100; 0: they come as they are."""
     lens: LensSettings = LensSettings()
-    """Falloff, blur and dust."""
     exposure: ExposureSettings = ExposureSettings()
-    """How grey levels follow time and gain."""
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -137,8 +126,7 @@ class ClockSettings(DriverOptions):
     own_stamps: bool = True
     """Whether that clock stamps its frames too; else the host's does, as the kernel's for V4L2 cameras."""
     stamped_late_s: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.0
-    """How much later than the exposure its stamps are; the negative of it is what the camera's ``offset_s``
-    in a configuration should be."""
+    """How much later than the exposure its stamps are: minus what ``offset_s`` of the camera should be."""
 
 
 class TemperatureSettings(DriverOptions):
@@ -147,20 +135,16 @@ class TemperatureSettings(DriverOptions):
     amplitude_k: Annotated[float, Field(ge=0.0, le=100.0)] = 0.0
     """Of the temperature about its mean."""
     period_s: Annotated[float, Field(ge=1.0, le=1e6)] = 86400.0
-    """A day."""
     phase_rad: Annotated[float, Field(ge=-6.2832, le=6.2832)] = 0.0
     """Of the sine at the start; 0: the mean, getting warmer."""
     focal_ppm_per_k: Annotated[float, Field(ge=-1000.0, le=1000.0)] = -31.0
     """How much longer the focal lengths get."""
     centre_x_px_per_k: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.05
-    """How far the images' centres move to the right; in right cameras, which are mounted as in a mirror, to
-    the left."""
+    """How far images' centres move to the right; in right cameras, mounted as in a mirror, to the left."""
     centre_y_px_per_k: Annotated[float, Field(ge=-1.0, le=1.0)] = 0.05
-    """How far they move down."""
     mount_tilt_rad_per_k: Annotated[float, Field(ge=-0.001, le=0.001)] = 2e-5
     """How far the head leans up, behind its joints."""
     mount_pan_rad_per_k: Annotated[float, Field(ge=-0.001, le=0.001)] = 1e-5
-    """How far it turns right."""
 
     def change_k(self, passed_s: float) -> float:
         """Return by how much it is warmer than the mean, kelvin, in whole steps."""
@@ -205,7 +189,6 @@ class ModeOptions(DriverOptions):
     binning: Annotated[tuple[int, int], wholes(2, 1, 64)] = (1, 1)
     """So many pixels across and down make one."""
     flip: FlipName = "none"
-    """Left to right, upside down."""
 
     @property
     def mode(self) -> Mode:
@@ -220,25 +203,20 @@ class SimulationSettings(DriverOptions):
     model_config = ConfigDict(arbitrary_types_allowed=True)
 
     rover: PathInFile
-    """The mast file of the true rig."""
     wire: Literal["dynamixel", "flir_ptu"] | None = None
     """Left out: the head is in memory; else the real driver turns it through a simulated line."""
     head: Annotated[HeadModel, ReadBy(head_settings)] = ABSENT
     """A preset, or a mapping (`drivers.sim.heads.head_settings`)."""
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 1
-    """Of scene and noise."""
     camera: Annotated[CameraSettings, Field(alias="cameras")] = CameraSettings()
-    """Rate, exposure and noise of every camera."""
     samples: Annotated[int, Field(ge=1, le=6)] = 2
     """Rays per pixel along each side: 2 is 2x2."""
     scene: Annotated[SceneSettings, ReadBy(scene_settings)] = ABSENT
-    """Ground, stones, boards and the sun."""
     faults: list[dict[str, Any]] = []  # noqa: RUF012  frozen
     """Faults set from the start, as ``FaultPanel.set_all`` reads them."""
     speed: Annotated[float, ReadBy(simulation_speed)] = 1.0
     """Of the clock that the rover lives on (`drivers.hardware.clock_for`); infinite: ``max``."""
     temperature: TemperatureSettings = TemperatureSettings()
-    """What a day does to the cameras."""
     clocks: dict[str, ClockSettings] = {}  # noqa: RUF012  frozen
     """By camera's name: when it exposes and what its stamps are worth; those of no entry are one and true."""
     sensor_modes: dict[str, ModeOptions] = {}  # noqa: RUF012  frozen

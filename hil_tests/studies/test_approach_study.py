@@ -15,7 +15,9 @@ from calib.files.mast_file import load_rig
 from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig
 from drivers.sim import rocks
-from drivers.sim.scene import Scene, tiny_scene
+from drivers.sim.placed import SceneSettings
+from drivers.sim.scene import Scene
+from hil_tests.drivers.sim.small_scenes import build_small_scene
 from tools.studies import approach
 from tools.studies.approach import ROCK_M, START_M, ApproachRun, Stop, approach_rows
 from tools.studies.approach_world import ApproachWorld, WorldErrors
@@ -55,14 +57,18 @@ def rig(repository: Path) -> Rig:
     return load_rig(repository / "configs/sim/rocky8.yaml").rig
 
 
+@pytest.fixture(scope="module")
+def level() -> Scene:
+    return build_small_scene(SceneSettings(relief_m=0.0, rocks=1))
+
+
 @pytest.fixture
-def standing(rig: Rig) -> Iterator[Callable[..., ApproachWorld]]:
+def standing(rig: Rig, level: Scene) -> Iterator[Callable[..., ApproachWorld]]:
     """Make worlds of level ground with these parts exchanged; the rover stands at its middle."""
     made: list[ApproachWorld] = []
 
     def world(seed: int = 1, **parts: Any) -> ApproachWorld:
-        scene = tiny_scene()
-        scene = Scene(scene.settings, scene.world._replace(**parts))
+        scene = Scene(level.settings, level.world._replace(**parts))
         made.append(ApproachWorld(scene, rig, rig, WorldErrors(), np.random.default_rng(seed)))
         return made[-1]
 

@@ -37,7 +37,6 @@ from calib.matching.warp import Plane, PosedImage, warp_patch
 from drivers.sim import kernels
 from drivers.sim import scene as site
 from drivers.sim.placed import SceneSettings
-from drivers.sim.render import compile_renderer
 from drivers.sim.rocks import make_brick, meshes, together
 from drivers.sim.scene import Scene, build_scene, sun_direction
 from mastctl.cli.options import at_least
@@ -370,7 +369,6 @@ class HandoffBlock:
 
 def run_block(block: HandoffBlock) -> list[list[HandoffOutcome]]:
     """Hand over the cases of a block: outcomes in each camera."""
-    compile_renderer()
     stage = Stage(block.true, block.believed, block.seed, block.kind, block.first)
     try:
         return list(stage.cases(block.count))

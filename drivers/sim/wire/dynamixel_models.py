@@ -9,7 +9,7 @@ dynamixel-sdk (checked in hil_tests).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -146,15 +146,15 @@ _P_BOUNDS = (
 _X_RAM, _P_RAM = 64, 512
 
 
-def _rows(text: str) -> list[TableRegister]:
-    """The registers of a table above."""
+def table_of(rows: str) -> tuple[TableRegister, ...]:
+    """Return the registers of rows as above, by address."""
     found = []
-    for line in filter(str.strip, text.splitlines()):
+    for line in filter(str.strip, rows.splitlines()):
         address, size, name, access, initial, *bounds = line.split()
         low, high = (int(b) for b in bounds) if bounds else (0, 256 ** int(size) - 1)
         first = 0 if initial == "-" else int(initial)
         found.append(TableRegister(int(address), int(size), name, access == "w", first, low, high))
-    return found
+    return tuple(sorted(found, key=lambda register: register.address))
 
 
 def _of_p(register: TableRegister) -> TableRegister:
@@ -165,19 +165,17 @@ def _of_p(register: TableRegister) -> TableRegister:
     return replace(register, name=name, address=register.address - _X_RAM + _P_RAM)
 
 
-def _bounded(table: list[TableRegister], changes: str) -> list[TableRegister]:
+def _bounded(table: Iterable[TableRegister], changes: str) -> tuple[TableRegister, ...]:
     """A table in which some registers have other values: ``name=initial,low,high``."""
     registers = {register.name: register for register in table}
     for change in changes.split():
         name, _, values = change.partition("=")
         initial, low, high = map(int, values.split(","))
         registers[name] = replace(registers[name], initial=initial, low=low, high=high)
-    return list(registers.values())
+    return tuple(sorted(registers.values(), key=lambda register: register.address))
 
 
 _RPM = math.tau / 60
-
-
 _X: dict[str, Any] = {
     "firmware": 45, "ram_from": 64, "counts_per_turn": 4096, "zero_counts": 2048,
     "velocity_unit_rad_per_s": 0.229 * _RPM, "acceleration_unit_rad_per_s2": 214.577 * _RPM / 60,
@@ -189,12 +187,12 @@ _P: dict[str, Any] = {
     "acceleration_unit_rad_per_s2": _RPM / 60, "current_unit_a": 0.001, "voltage_v": 24.0,
 }  # fmt: skip
 
-_X_TABLE = _rows(_EEPROM + _RAM)
-_MX_TABLE = _rows(_EEPROM + _RAM + _ACCELERATION_LIMIT)
-_P_TABLE = _bounded([_of_p(register) for register in _MX_TABLE], _P_BOUNDS)
+_X_TABLE = table_of(_EEPROM + _RAM)
+_MX_TABLE = table_of(_EEPROM + _RAM + _ACCELERATION_LIMIT)
+_P_TABLE = _bounded(map(_of_p, _MX_TABLE), _P_BOUNDS)
 _CURRENT = ("current_limit", "goal_current", "present_current")
 _X_LOAD, _MX_LOAD = (
-    [*(one for one in table if one.name not in _CURRENT), *_rows(_LOAD)] for table in (_X_TABLE, _MX_TABLE)
+    [*(one for one in table if one.name not in _CURRENT), *table_of(_LOAD)] for table in (_X_TABLE, _MX_TABLE)
 )
 _SERIES: Mapping[str, Mapping[str, Any]] = {
     "x330_5v": _X330 | {"registers": _X_TABLE, "voltage_v": 5.0},
@@ -261,9 +259,9 @@ _ROWS = (
 
 def _model(row: str) -> SimulatedModel:
     """One row of the table."""
-    name, number, series, *changes = row.split()
-    table = sorted(_bounded(_SERIES[series]["registers"], " ".join(changes)), key=lambda one: one.address)
-    return replace(SimulatedModel(name, int(number), **_SERIES[series]), registers=tuple(table))
+    name, number, series, changes = (*row.split(" ", 3), "")[:4]
+    model = SimulatedModel(name, int(number), **_SERIES[series])
+    return replace(model, registers=_bounded(model.registers, changes))
 
 
 MODELS: Mapping[str, SimulatedModel] = {model.name: model for model in map(_model, _ROWS)}

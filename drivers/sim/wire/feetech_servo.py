@@ -15,6 +15,7 @@ from functools import cached_property
 from drivers.errors import BadOptions
 from drivers.faults import nearest
 from drivers.sim.axis import WireAxis
+from drivers.sim.wire.dynamixel_models import TableRegister, table_of
 
 _COMMON = """
  0 1 firmware_major      r 3
@@ -73,25 +74,12 @@ RAM_FROM = 40
 
 
 @dataclass(frozen=True)
-class Cell:
-    """One entry of a memory table."""
-
-    address: int
-    size: int
-    name: str
-    writable: bool
-    initial: int
-    low: int
-    high: int
-
-
-@dataclass(frozen=True)
 class SimulatedFeetech:
     """One model of servo; with ``sync_read`` it answers a read of several servos at once."""
 
     name: str
     number: int
-    cells: tuple[Cell, ...]
+    cells: tuple[TableRegister, ...]
     big_end: bool
     turn_rad: float
     counts: int
@@ -104,23 +92,12 @@ class SimulatedFeetech:
         return self.turn_rad / self.counts
 
     @cached_property
-    def by_name(self) -> Mapping[str, Cell]:
+    def by_name(self) -> Mapping[str, TableRegister]:
         """Cells by name."""
         return {cell.name: cell for cell in self.cells}
 
 
-def _cells(text: str) -> tuple[Cell, ...]:
-    found = []
-    for line in text.split("\n"):
-        if row := line.split():
-            address, size, name, access, initial, *ends = row
-            low, high = (int(end) for end in ends or (0, 0))
-            start = 0 if initial == "-" else int(initial)
-            found.append(Cell(int(address), int(size), name, access == "w", start, low, high))
-    return tuple(sorted(found, key=lambda cell: cell.address))
-
-
-_STS, _SCS = _cells(_COMMON + _OF_STS), _cells(_COMMON + _OF_SCS)
+_STS, _SCS = table_of(_COMMON + _OF_STS), table_of(_COMMON + _OF_SCS)
 MODELS: Mapping[str, SimulatedFeetech] = {
     "sts3215": SimulatedFeetech("sts3215", 777, _STS, False, math.tau, 4096, True, 12.0),
     "sts3250": SimulatedFeetech("sts3250", 2825, _STS, False, math.tau, 4096, True, 12.0),
@@ -156,9 +133,8 @@ _PROTECTIVE_UNIT_S = 0.01
 class SimulatedFeetechServo:
     """One servo; every method is given the time and nothing runs by itself.
 
-    Raises BadOptions for an unknown model or name, or a value that the memory cannot hold.
-
     ``settings`` are initial values of its memory by name; those of the EEPROM outlast the power switch.
+    Raises BadOptions for an unknown model or name, or a value that the memory cannot hold.
     """
 
     def __init__(
@@ -184,7 +160,6 @@ class SimulatedFeetechServo:
         self.memory = {cell.name: cell.initial for cell in self.model.cells}
         self.memory |= {"model": self.model.number, **given}
         self._kept = dict(self.memory)
-        self._raised = 0
         self._pressing_since_s: float | None = None
         self._zero = self.model.counts // 2
         self.memory["goal_position"] = self._position(time_s)
@@ -221,19 +196,14 @@ class SimulatedFeetechServo:
             if "torque_limit" in self.memory:
                 self.memory["torque_limit"] = self.memory["max_torque"]
             self.memory["goal_position"] = self._position(time_s)
-            self._raised = 0
         elif not on:
             self.memory["torque_enable"] = 0
             self._axis.halt(time_s)
         self.powered = on
 
-    def raise_error(self, bits: int) -> None:
-        """Let a fault of its own happen, for example ``SENSOR``; it stays until the power switch."""
-        self._raised |= bits
-
     def status(self, time_s: float) -> int:
         """Return the bits that every answer carries."""
-        memory, bits = self.memory, self._raised
+        memory, bits = self.memory, 0
         tenths = round(10 * self.model.volts * self._axis.supply(time_s))
         if not memory["min_voltage"] <= tenths <= memory["max_voltage"]:
             bits |= VOLTAGE

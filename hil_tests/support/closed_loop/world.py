@@ -62,8 +62,8 @@ class LoopWorld:
         self.rig = load_rig(rig).rig
         self.seed = seed
         self.head = PRESETS[files.HEAD]
-        compile_renderer()
         self.scene = build_scene(SceneSettings(seed=seed))
+        compile_renderer(self.scene)
         self._renderer = Renderer(self.scene)
         self._drawing = threading.Lock()
         clock = SystemClock()
