@@ -140,6 +140,16 @@ class Ray(NamedTuple):
     dz: float
 
 
+class Meeting(NamedTuple):
+    """Where a ray meets a rock: metres, rock, triangle, weights of its corners 1 and 2; NOTHING: no rock."""
+
+    s: float
+    rock: int
+    triangle: int
+    u: float
+    v: float
+
+
 def _borrowed(_context: Any, value: Any) -> Any:
     """Return an array, or tuples of arrays, without owners, so that passing it on counts no references.
 
@@ -583,10 +593,8 @@ def in_beam(balls: Float64, k: int, ray: Ray, spread: float, rho: float) -> bool
 
 
 @part
-def nearest_rock(
-    rocks: Rocks, near: Int64, count: int, ray: Ray, limit: float
-) -> tuple[float, int, int, float, float]:
-    """First meeting with one of ``count`` rocks before ``limit``: (s, rock, triangle, weights)."""
+def nearest_rock(rocks: Rocks, near: Int64, count: int, ray: Ray, limit: float) -> Meeting:
+    """First meeting with one of ``count`` rocks before ``limit``."""
     s, rock, triangle, u, v = limit, NOTHING, NOTHING, 0.0, 0.0
     for j in range(count):
         k = near[j]
@@ -594,7 +602,7 @@ def nearest_rock(
             met_s, met_t, met_u, met_v = cross_rock(rocks, k, ray, s)
             if met_s < s:
                 s, rock, triangle, u, v = met_s, k, met_t, met_u, met_v
-    return s, rock, triangle, u, v
+    return Meeting(s, rock, triangle, u, v)
 
 
 @entry
@@ -712,23 +720,14 @@ def stretched_brightness(
 
 @inlined
 def ground_light(
-    grid: Grid,
-    broad: Texture,
-    detail: Texture,
-    ix: int,
-    iy: int,
-    x: float,
-    y: float,
-    s: float,
-    dx: float,
-    dy: float,
-    de: float,
-    pitch: float,
+    grid: Grid, broad: Texture, detail: Texture, ix: int, iy: int, ray: Ray, s: float, pitch: float
 ) -> float:
     """Brightness of a ground point seen from s metres with a sample pitch of ``pitch`` radians.
 
-    (x, y) counts from the inner grid's corner, so that its cells and the texels of ``broad`` coincide.
+    The ray is at the point. Its (x, y) counts from the inner grid's corner, so that its cells and the texels
+    of ``broad`` coincide.
     """
+    x, y, dx, dy = ray.x, ray.y, ray.dx, ray.dy
     inv = 0.5 / grid.cell_m
     h00 = grid.elevation_m[iy, ix]
     h10 = grid.elevation_m[iy, ix + 1]
@@ -737,7 +736,7 @@ def ground_light(
     sx = (h10 - h00 + h11 - h01) * inv
     sy = (h01 - h00 + h11 - h10) * inv
     norm = 1.0 / math.sqrt(1.0 + sx * sx + sy * sy)
-    facing = max((sx * dx + sy * dy - de) * norm, 0.03)  # cosine between ray and the normal (-sx, -sy, 1)
+    facing = max((sx * dx + sy * dy + ray.dz) * norm, 0.03)  # cosine between ray and the normal (-sx, -sy, 1)
     short = s * pitch
     long = short / facing
     level = 1.0 / math.sqrt(dx * dx + dy * dy + 1e-12)
@@ -751,19 +750,13 @@ def ground_light(
 
 @part
 def hits_light(
-    grid: Grid,
-    broad: Texture,
-    detail: Texture,
-    hits: Float64,
-    count: int,
-    together: bool,
-    pitch: float,
-    wide_pitch: float,
+    world: World, hits: Float64, count: int, together: bool, pitch: float, wide_pitch: float
 ) -> float:
-    """Sum of the brightness of ``count`` hits of one pixel on the ground (n, 6: x, y, s, dx, dy, de).
+    """Sum of the brightness of ``count`` hits of one pixel on the ground (n, 6: x, y, s, dx, dy, dz).
 
     ``together`` looks the texture up once for all of them, at their middle and with the pixel's own pitch.
     """
+    grid = world.inner
     last = grid.cells - 1
     inv_cell = 1.0 / grid.cell_m
     looks, share = count, 1.0
@@ -778,26 +771,15 @@ def hits_light(
     for k in range(looks):
         x, y = hits[k, 0], hits[k, 1]
         ix, iy = min(int(x * inv_cell), last), min(int(y * inv_cell), last)
-        total += ground_light(
-            grid, broad, detail, ix, iy, x, y, hits[k, 2], hits[k, 3], hits[k, 4], hits[k, 5], pitch
-        )
+        ray = Ray(x, y, 0.0, hits[k, 3], hits[k, 4], hits[k, 5])
+        total += ground_light(grid, world.broad, world.detail, ix, iy, ray, hits[k, 2], pitch)
     return total * share
 
 
 @part
-def rock_light(
-    rocks: Rocks,
-    texture: Texture,
-    sun: Float64,
-    k: int,
-    t: int,
-    u: float,
-    v: float,
-    ray: Ray,
-    s: float,
-    pitch: float,
-) -> float:
+def rock_light(rocks: Rocks, texture: Texture, sun: Float64, met: Meeting, ray: Ray, pitch: float) -> float:
     """Brightness of a point of a rock: stone texture laid on from three sides, sun on the bent normal."""
+    s, k, t, u, v = met
     x, y, z = ray.x + s * ray.dx, ray.y + s * ray.dy, ray.z + s * ray.dz
     w = 1.0 - u - v
     normals = rocks.normals
@@ -1072,29 +1054,26 @@ def pixel_light(
         if beyond:
             s, ix, iy = cross_outer(inner, outer, ray, block.clear_beyond_m)
         if block.n_near > 0:
-            s, rock, triangle, u, v = nearest_rock(world.rocks, near, block.n_near, ray, s)
-            if rock != NOTHING:
-                total += rock_light(
-                    world.rocks, world.stone, world.sun, rock, triangle, u, v, ray, s, block.pitch
-                )
+            met = nearest_rock(world.rocks, near, block.n_near, ray, s)
+            if met.rock != NOTHING:
+                total += rock_light(world.rocks, world.stone, world.sun, met, ray, block.pitch)
                 continue
         if s >= FAR:
             total += sky_light(-dz)
             continue
         px, py = ox + s * dx - inner.x0_m, oy + s * dy - inner.y0_m
         if beyond:
-            total += ground_light(
-                outer, world.broad, world.detail, ix, iy, px, py, s, dx, dy, -dz, block.pitch
-            )
+            there = Ray(px, py, 0.0, dx, dy, dz)
+            total += ground_light(outer, world.broad, world.detail, ix, iy, there, s, block.pitch)
             continue
         hits[grounded, 0], hits[grounded, 1], hits[grounded, 2] = px, py, s
-        hits[grounded, 3], hits[grounded, 4], hits[grounded, 5] = dx, dy, -dz
+        hits[grounded, 3], hits[grounded, 4], hits[grounded, 5] = dx, dy, dz
         nearest, farthest = min(nearest, s), max(farthest, s)
         grounded += 1
     if grounded > 0:
         together = rays_shared and farthest < nearest * ONE_PATCH
         wide = block.pitch * math.sqrt(q)
-        total += hits_light(inner, world.broad, world.detail, hits, grounded, together, block.pitch, wide)
+        total += hits_light(world, hits, grounded, together, block.pitch, wide)
     return total / rays_met if rays_met > 0 else math.nan
 
 
