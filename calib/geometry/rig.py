@@ -41,7 +41,6 @@ MOST_HARMONICS = 2
 STEEPEST = 0.25
 """Σ i |(c_i, s_i)| of an axis at most: Newton's steps from the identity then come home from any angle."""
 LARGEST_BACKLASH_RAD = 0.2
-_STEPS = 60  # four do for tens of milliradians
 
 AXIS_NAMES = ("c1", "s1", "c2", "s2", "backlash_rad")
 JOINTS_NAMES = tuple(f"joints.{axis}.{name}" for axis in ("pan", "tilt") for name in AXIS_NAMES)
@@ -103,57 +102,52 @@ class AxisJoint:
         ``approach`` is +1 from smaller read angles, -1 from larger, 0 if not known: the middle; in between
         where the load lies between the flanks.
         """
-        return self._true(self._taken_up(read_rad, approach))
+        return self._true(read_rad - self._slack(approach))[0]
 
     def read_rad(self, true_rad: _Angle, approach: float | FloatArray = 0.0) -> _Angle:
         """Return the reading of a true angle (or of an array of them), exact to rounding."""
-        slack: Any = 0.5 * approach * self.backlash_rad
         at = true_rad
-        for _ in range(_STEPS):
-            step = (self._true(at) - true_rad) / self._slope(at)
+        for _ in range(60):  # four do for tens of milliradians
+            found, slope = self._true(at)
+            step = (found - true_rad) / slope
             at = at - step
             if np.max(np.abs(step), initial=0.0) <= 1e-15 * (1.0 + np.max(np.abs(at), initial=0.0)):
                 break
-        found: _Angle = at + slack
-        return found
+        return at + self._slack(approach)
 
     def goal_rad(self, true_rad: float, read_rad: float, approach: float = 0.0, turn: int = 0) -> float:
         """Return the reading to send an axis to, which is at a reading and approach, to reach a true angle.
 
         ``turn`` is 1 or -1 for a head that comes to this goal from smaller or from larger angles by itself.
         """
-        wanted, present = self.read_rad(true_rad), self._taken_up(read_rad, approach)
+        wanted, present = self.read_rad(true_rad), read_rad - self._slack(approach)
         turn = turn or (wanted > present) - (wanted < present)
         return wanted + 0.5 * turn * self.backlash_rad if turn else read_rad
 
     def slope(self, read_rad: _Angle, approach: float | FloatArray = 0.0) -> _Angle:
         """Return by how much the true angle grows with the reading, radians in a radian."""
-        return self._slope(self._taken_up(read_rad, approach))
+        return self._true(read_rad - self._slack(approach))[1]
 
     def rates(self, read_rad: ArrayLike, approach: ArrayLike = 0) -> FloatArray:
         """Return (..., 5): how the true angle changes with the numbers `AXIS_NAMES`, the reading fixed."""
         side = np.asarray(approach, dtype=np.float64)
-        at = np.asarray(read_rad, dtype=np.float64) - 0.5 * side * self.backlash_rad
-        slack = -0.5 * side * self._slope(at)
+        at = np.asarray(read_rad, dtype=np.float64) - self._slack(side)
+        slack = -0.5 * side * self._true(at)[1]
         return np.stack([np.cos(at), np.sin(at), np.cos(2.0 * at), np.sin(2.0 * at), slack], axis=-1)
 
-    def _taken_up(self, read_rad: _Angle, approach: float | FloatArray) -> _Angle:
-        """The reading without the play."""
-        slack: Any = 0.5 * approach * self.backlash_rad
-        taken_up: _Angle = read_rad - slack
-        return taken_up
+    def _slack(self, approach: Any) -> float:
+        """How far the reading is before the load that comes from this side; of an array an array."""
+        slack: float = 0.5 * approach * self.backlash_rad
+        return slack
 
-    def _true(self, at_rad: _Angle) -> _Angle:
-        true = at_rad
+    def _true(self, at_rad: _Angle) -> tuple[_Angle, _Angle]:
+        """The true angle of a reading without play, and how it grows with it."""
+        true, slope = at_rad, 1.0 + 0.0 * at_rad
         for i, (c, s) in enumerate(self.harmonics_rad, 1):
-            true = true + c * _cos(i * at_rad) + s * _sin(i * at_rad)
-        return true
-
-    def _slope(self, at_rad: _Angle) -> _Angle:
-        slope = 1.0 + 0.0 * at_rad
-        for i, (c, s) in enumerate(self.harmonics_rad, 1):
-            slope = slope + i * (s * _cos(i * at_rad) - c * _sin(i * at_rad))
-        return slope
+            cos, sin = _turn(i * at_rad)
+            true = true + c * cos + s * sin
+            slope = slope + i * (s * cos - c * sin)
+        return true, slope
 
 
 @dataclass(frozen=True)
@@ -202,12 +196,10 @@ def _without_zeros(pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
     return pairs
 
 
-def _cos(at_rad: _Angle) -> _Angle:
-    return math.cos(at_rad) if isinstance(at_rad, float) else np.cos(at_rad)
-
-
-def _sin(at_rad: _Angle) -> _Angle:
-    return math.sin(at_rad) if isinstance(at_rad, float) else np.sin(at_rad)
+def _turn(at_rad: _Angle) -> tuple[_Angle, _Angle]:
+    """Cosine and sine; of a float as floats."""
+    kind: Any = math if isinstance(at_rad, float) else np
+    return kind.cos(at_rad), kind.sin(at_rad)
 
 
 @dataclass(frozen=True, eq=False)
