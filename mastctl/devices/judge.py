@@ -321,12 +321,12 @@ class KeepOutJudge:
         if keep_outs is not None:
             keep_outs.refuse_unless_free(Span.around(start), goal, True)
 
-    def room(self, place: Pair) -> Span | None:
+    def free_span(self, place: Pair) -> Span | None:
         """Return a free rectangle within the limits about a place, moved into them; None if kept out."""
         limits, keep_outs = self.limits, self._now()
         within = Span(limits.pan_rad, limits.tilt_rad)
         on = _into(place[0], limits.pan_rad), _into(place[1], limits.tilt_rad)
-        return within if keep_outs is None else keep_outs.room(on, within)
+        return within if keep_outs is None else keep_outs.free_span(on, within)
 
     def check_move(self, goal: Pair, read: Callable[[], Reading]) -> Span | None:
         """Pass a move to a goal within the limits that may go out now; return where it begins, for `sent`.

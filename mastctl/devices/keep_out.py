@@ -16,7 +16,7 @@ from mastctl.errors import BadRequest
 
 Pair = tuple[float, float]
 
-ROOM_PARTS = 32
+SPAN_PARTS = 32
 TOUCH_RAD = 1e-9  # closer than this is the edge itself
 ASIDE_RAD = 5e-3  # a move along one axis leaves the other where it was read: three counts of a 12-bit servo
 
@@ -141,14 +141,14 @@ class KeepOuts:
                 where = "in" if point.enters(box.span) else "too near to"
                 raise KeptOut(box.name, f"{_text(goal)} is {where} the {box}{self._slack_text()}")
 
-    def room(self, place: Pair, most: Span) -> Span | None:
+    def free_span(self, place: Pair, most: Span) -> Span | None:
         """Return ``most``, shrunk evenly towards a place in it until no keep-out reaches into it, or None."""
         span, (pan, tilt) = most, place
-        for part in range(ROOM_PARTS - 1, -2, -1):
+        for part in range(SPAN_PARTS - 1, -2, -1):
             if not any(span.enters(full) for full in self.full):
                 return span
             (left, low), (right, high) = (
-                (pan + part / ROOM_PARTS * (to_pan - pan), tilt + part / ROOM_PARTS * (to_tilt - tilt))
+                (pan + part / SPAN_PARTS * (to_pan - pan), tilt + part / SPAN_PARTS * (to_tilt - tilt))
                 for to_pan, to_tilt in most.corners
             )
             span = Span((left, right), (low, high))

@@ -5,12 +5,10 @@ All geometry is by the mast file and the true joint angles measured.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +21,7 @@ from calib.matching.patch import MatchSettings, PatchMatch, match_patch
 from calib.matching.shown_view import FLOOR_RAD, Posed, ShownView, overlap, shown_view
 from calib.matching.warp import Plane, PosedImage, Relief, carry, facing_plane, grey
 from drivers.errors import BadFrame, DriverError
-from drivers.interfaces import AxisReport
+from mastctl.devices.devices import Devices
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.keep_out import Pair
@@ -34,32 +32,6 @@ BESIDE = "; try a pixel beside it"
 """To a person who clicked: at a rim or on bare ground a neighbour may match."""
 LEAST_OVERLAP = 0.15
 """Less of an image in common is not worth an image before the move."""
-
-
-class DevicesLike(Protocol):
-    """What of `mastctl.devices.devices.Devices` a pointing needs."""
-
-    def read(self) -> HeadReading: ...
-    @property
-    def reading_sigma_rad(self) -> Pair: ...
-    @property
-    def counts_rad(self) -> Mapping[str, float]: ...
-    @property
-    def reports(self) -> Mapping[str, AxisReport]: ...
-    def goal(self, true_rad: Pair, start: HeadReading, /) -> Pair: ...
-    def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None: ...
-    def stop(self) -> None: ...
-    def check_from(self, start: Pair, goal: Pair) -> None: ...
-    def frames(
-        self,
-        cameras: Sequence[str],
-        exposed_after_s: float,
-        timeout_s: float,
-        check: Callable[[], None] = ...,
-    ) -> dict[str, StampedFrame]: ...
-    def newest_frames(self) -> Mapping[str, StampedFrame | None]: ...
-    def frame_by_id(self, frame_id: str) -> StampedFrame: ...
-    def exposure_held(self) -> AbstractContextManager[None]: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +65,7 @@ class RigCameras:
 
     def __init__(
         self,
-        devices: DevicesLike,
+        devices: Devices,
         rig: Rig,
         settings: PointingSettings,
         check: Callable[[], None] = lambda: None,
@@ -139,11 +111,6 @@ class RigCameras:
         views = {}
         timeout_s = self._settings.frame_timeout_s if timeout_s is None else timeout_s
         for name, frame in self._devices.frames(names, after_s, timeout_s, self._check).items():
-            if frame.exposure_began_s < after_s:
-                early_s = after_s - frame.exposure_began_s
-                raise PointingError(
-                    "no_fresh_frame", f"an image of {name} was exposed {early_s:.3f} s too early"
-                )
             apart = max(abs(frame.pan_rad - resting.pan_rad), abs(frame.tilt_rad - resting.tilt_rad))
             if frame.moving or not apart <= self._settings.rest_tolerance_rad:
                 where = f"an image of {name} was exposed ({apart:.4f} rad off its rest)"
@@ -152,9 +119,7 @@ class RigCameras:
         return views
 
     def view(self, frame: StampedFrame) -> CameraView:
-        """Return a frame with its camera. Raises PointingError ``bad_reading``."""
-        if not all(map(math.isfinite, (frame.pan_rad, frame.tilt_rad, *frame.true_rad))):
-            raise PointingError("bad_reading", f"frame {frame.frame_id} has no finite joint angles")
+        """Return a frame with its camera."""
         camera = self._rig.camera_in_rover(frame.camera, *frame.true_rad)
         return CameraView(grey(frame.image), camera, frame)
 

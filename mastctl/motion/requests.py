@@ -166,7 +166,7 @@ class PointRequest(TrackRequest):
         return None if self.pan_rad is None or self.tilt_rad is None else (self.pan_rad, self.tilt_rad)
 
     @property
-    def looks(self) -> int:
+    def captures(self) -> int:
         """How often it goes somewhere and takes images there."""
         return 0 if self.angles_rad is not None else self.pointings
 

@@ -33,11 +33,12 @@ from calib.matching.patch import PatchMatch
 from calib.matching.track import Track, start_track
 from drivers.clock import Clock
 from mastctl.answers import CameraPixel, Step
+from mastctl.devices.devices import Devices
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.judge import Limits
 from mastctl.devices.keep_out import KeptOut, Pair
 from mastctl.errors import MastctlError
-from mastctl.motion.measurement import CameraView, DevicesLike, available, rounded
+from mastctl.motion.measurement import CameraView, available, rounded
 from mastctl.motion.requests import PixelTarget
 from mastctl.motion.settings import HandoffRules, PointingSettings, TrackingSettings
 from mastctl.motion.steps import Steps
@@ -104,7 +105,7 @@ class TargetSearch(Steps):
     def __init__(
         self,
         rig: Rig,
-        devices: DevicesLike,
+        devices: Devices,
         limits: Limits,
         clock: Clock,
         settings: TrackingSettings,

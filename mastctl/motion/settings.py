@@ -29,7 +29,6 @@ class PointingSettings:
     servo. What remains is measured in the image."""
     acceleration_s: float = 1.5  # beyond distance over speed: ramps, and an approach from one side
     margin_s: float = 2.5  # everything else
-    reading_age_s: float = 1.0  # oldest reading that is one of now
     jump_rad: float = 0.035  # beyond what twice the speed allows between readings: two slips of a degree
     rest_wait_s: float = 2.0  # how long a request waits for a head that still moves
     frame_timeout_s: float = 8.0  # for a new image: some frames of a slow camera, on a busy machine

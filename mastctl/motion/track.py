@@ -25,16 +25,16 @@ from mastctl.answers import Handover, PoseTold, TrackStands, TrackState
 from mastctl.as_json import as_json
 from mastctl.control.machine import StateMachine
 from mastctl.control.operations import Operation, OperationRunner
+from mastctl.devices.devices import Devices
 from mastctl.devices.judge import Limits
 from mastctl.errors import BadRequest, MastctlError, NotNow
-from mastctl.motion.measurement import DevicesLike
 from mastctl.motion.requests import TrackRequest
 from mastctl.motion.search import TargetSearch, TrackSighting
 from mastctl.motion.settings import TrackingSettings
 
 log = logging.getLogger(__name__)
 
-STANDS_M, STANDS_RAD = 0.005, 0.001
+STILL_M, STILL_RAD = 0.005, 0.001
 """Within these of each other two poses are one, stated twice: an odometer's noise, no motion."""
 
 HELD_UP_S = 60.0
@@ -104,10 +104,10 @@ def motion_between(before: RoverPose, now: RoverPose) -> Rigid:
     return now.site_from_rover.inverse @ before.site_from_rover
 
 
-def stands(motion: Rigid) -> bool:
+def is_still(motion: Rigid) -> bool:
     """Return whether a motion is none."""
     turned_rad = math.acos(min(1.0, max(-1.0, (float(np.trace(motion.rotation)) - 1) / 2)))
-    return float(np.linalg.norm(motion.translation_m)) <= STANDS_M and turned_rad <= STANDS_RAD
+    return float(np.linalg.norm(motion.translation_m)) <= STILL_M and turned_rad <= STILL_RAD
 
 
 def _clock_was_set(pose: RoverPose, before: RoverPose) -> bool:
@@ -253,7 +253,7 @@ class Tracker:
     def __init__(
         self,
         operations: OperationRunner,
-        devices: DevicesLike,
+        devices: Devices,
         rig: Rig,
         limits: Limits,
         clock: Clock,
@@ -337,7 +337,7 @@ class Tracker:
                 message = "the clock of the rover's poses was set, or is another: %g s after %g s"
                 log.info(message, pose.time_s, before.time_s)
             on_taken(pose)
-            if before is not None and not stands(motion_between(before, pose)):
+            if before is not None and not is_still(motion_between(before, pose)):
                 self.moved_s = pose.received_s
             status = replace(self._status, pose=pose)
             if active and before is None:
@@ -345,7 +345,7 @@ class Tracker:
                 return None
             if active:
                 stood = status.stands_at
-                if stood is not None and not stands(motion_between(stood, pose)):
+                if stood is not None and not is_still(motion_between(stood, pose)):
                     status = replace(status, predicted=True)
                 if status.operation is not None:
                     self._waiting.append(pose)
@@ -402,7 +402,7 @@ class Tracker:
 
     def _lose(self, motion: Rigid) -> None:
         """Declare the target lost if the rover moved by a pose that says too little to be followed."""
-        if stands(motion):
+        if is_still(motion):
             return
         self._left = True
         track = self._status.track
@@ -548,7 +548,7 @@ class Tracker:
     def _left_by(self, poses: Sequence[RoverPose]) -> bool:
         """Whether the rover left its pose by poses that came since."""
         stood = self._status.stands_at
-        return stood is not None and any(not stands(motion_between(stood, one)) for one in poses)
+        return stood is not None and any(not is_still(motion_between(stood, one)) for one in poses)
 
 
 def _why(operation: Operation) -> str:

@@ -86,7 +86,7 @@ def add_pointing(app: FastAPI) -> None:
         POINT,
         "Point at a pixel, a position, or joint angles",
         status_code=202,
-        usual_s=lambda here, body: usual_s(here.service.config.limits, body.looks),
+        usual_s=lambda here, body: usual_s(here.service.config.limits, body.captures),
     )
     def point(body: PointRequest, here: Here) -> Started:
         return {"id": here.service.steering.point(body, body.model_dump(exclude_none=True)).id}

@@ -144,7 +144,7 @@ def test_no_free_place_of_a_fine_grid_is_nearer_than_the_goal_named() -> None:
     assert searched > 20
 
 
-def test_the_room_about_a_place_holds_it_and_no_keep_out() -> None:
+def test_the_free_span_about_a_place_has_it_and_no_keep_out() -> None:
     draw = random.Random(4)
 
     def between(low: float, high: float) -> Pair:
@@ -159,7 +159,7 @@ def test_the_room_about_a_place_holds_it_and_no_keep_out() -> None:
         keep_outs = KeepOuts(boxes, 0.02, (0.03, 0.0), most.pan_rad, most.tilt_rad)
         here = draw.uniform(-1.0, 1.0), draw.uniform(-0.5, 0.5)
         room, free = (
-            keep_outs.room(here, most),
+            keep_outs.free_span(here, most),
             not any(Span.around(here).enters(one) for one in keep_outs.full),
         )
         assert (room is not None) == free, (boxes, here)

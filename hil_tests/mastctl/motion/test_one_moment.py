@@ -29,7 +29,8 @@ def test_eyes_that_expose_apart_measure_what_stands_still() -> None:
 
 def checked(world: World) -> dict[str, object]:
     """What the check says of a pair that is taken now."""
-    cameras, resting = RigCameras(world, rig(), PointingSettings()), world.read()
+    cameras = RigCameras(world, rig(), PointingSettings())  # type: ignore[arg-type]
+    resting = world.read()
     views = cameras.new(("navcam_left", "navcam_right"), world.clock.now_s(), resting)
     one, other = views["navcam_left"], views["navcam_right"]
     return cameras.check_one_moment(one, np.array([150.0, 120.0]), [other], resting)

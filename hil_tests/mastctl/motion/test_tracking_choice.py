@@ -18,7 +18,7 @@ from calib.geometry.rigid import Rigid, carried_covariance
 from mastctl.errors import MastctlError
 from mastctl.motion.search import choose_pairs
 from mastctl.motion.settings import HandoffRules, PairBounds
-from mastctl.motion.track import HELD_UP_S, RoverPose, check_follows, motion_between, stands
+from mastctl.motion.track import HELD_UP_S, RoverPose, check_follows, is_still, motion_between
 
 
 @pytest.fixture(scope="module")
@@ -143,9 +143,9 @@ def test_a_motion_is_where_the_frame_before_lies_in_the_one_of_now() -> None:
     motion = motion_between(pose(None), pose(None, 2.0, math.pi / 2))
     # After 2 m ahead and a quarter turn to the right, what was 3 m ahead is 1 m to the left.
     assert motion.points([3.0, 0.0, 0.0]) == pytest.approx([0.0, -1.0, 0.0])
-    assert not stands(motion)
-    assert stands(motion_between(pose(None), pose(None, 0.004, 0.0009)))
-    assert not stands(motion_between(pose(None), pose(None, 0.0, 0.0012)))
+    assert not is_still(motion)
+    assert is_still(motion_between(pose(None), pose(None, 0.004, 0.0009)))
+    assert not is_still(motion_between(pose(None), pose(None, 0.0, 0.0012)))
 
 
 def test_a_covariance_carried_on_moves_points_as_the_motions_themselves_do() -> None:

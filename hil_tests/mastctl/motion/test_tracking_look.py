@@ -49,7 +49,7 @@ class Eyes(World):
 def search(world: World, steps: list[Step] | None = None, believed: Rig | None = None) -> TargetSearch:
     record = ([] if steps is None else steps).append
     settings, stopped = TrackingSettings(), threading.Event()
-    return TargetSearch(believed or rig(), world, LIMITS, world.clock, settings, record, stopped)
+    return TargetSearch(believed or rig(), world, LIMITS, world.clock, settings, record, stopped)  # type: ignore[arg-type]
 
 
 def begun(world: World) -> tuple[Track, np.ndarray]:

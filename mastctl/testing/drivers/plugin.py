@@ -191,7 +191,7 @@ def head_under_test(
         except (PromiseBroken, SubjectLost, DriverError) as reason:  # the tests have to report it
             trial.unplaced = f"its present pose is not known: {reason}"
         else:
-            free = head.judge.room(at(first))
+            free = head.judge.free_span(at(first))
             if free is None:
                 trial.unplaced = "it is in a keep-out, or too near to one"
             else:
