@@ -37,8 +37,8 @@ from mastctl.http.tokens import Access, TokenList
 from mastctl.http.waiting import Listener, SilentConnections, Streams, Waiting
 from mastctl.logs import stall_while
 from mastctl.safety.state_folder import StateFolder
-from mastctl.safety.stop_socket import StopsHang
 from mastctl.service.service import Service
+from mastctl.service.stopping import StopsHang
 from mastctl.service_manager import Heartbeat, ServiceManager
 from mastctl.web.app import create_app
 from mastctl.web.parts import Parts

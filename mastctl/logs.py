@@ -16,6 +16,7 @@ import select
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from functools import cache
 from queue import SimpleQueue
@@ -101,17 +102,14 @@ class QueuedWriter:
         self.descriptor = descriptor
         self._kept = kept
         self._queue: SimpleQueue[Message | threading.Event] = SimpleQueue()
-        self._dropped = 0
+        self._dropped = deque[None]()  # one for each dropped message
         self.own_line: Callable[[str], str] = lambda message: f"mastctl: {message}\n"
-        # Reentrant, because a signal's handler or a finaliser may log in the middle of it.
-        self._counting = threading.RLock()
         threading.Thread(target=self._work, name="output", daemon=True).start()
 
     def put(self, message: Message) -> None:
         """Have a text written, or a function's result, made in the writing thread; returns at once."""
         if self._queue.qsize() >= self._kept:
-            with self._counting:
-                self._dropped += 1
+            self._dropped.append(None)
             return
         if self._dropped:
             self._queue.put(self._dropped_line)
@@ -124,8 +122,11 @@ class QueuedWriter:
         return written.wait(timeout_s)
 
     def _dropped_line(self) -> str:
-        with self._counting:
-            dropped, self._dropped = self._dropped, 0
+        dropped = 0
+        with contextlib.suppress(IndexError):
+            while True:
+                self._dropped.popleft()
+                dropped += 1
         if not dropped:
             return ""
         return self.own_line(f"{dropped} messages were dropped here while this output was not read")

@@ -28,8 +28,8 @@ from mastctl.config import load_config
 from mastctl.control import operations as operations_module
 from mastctl.daemon import AddressInUse, RunningDaemon, _suspend
 from mastctl.devices import devices as devices_module
-from mastctl.safety.stop_socket import StopThreads
 from mastctl.service import service as service_module
+from mastctl.service.stopping import StopThreads
 
 
 def test_a_signal_while_the_daemon_starts_ends_it_cleanly(tmp_path: Path) -> None:

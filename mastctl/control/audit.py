@@ -10,6 +10,7 @@ import contextlib
 import json
 import logging
 import threading
+from collections import deque
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -51,8 +52,7 @@ class AuditLog:
         self._device = device
         self._clock = clock or SystemClock()
         self._queue: Queue[Mapping[str, Any] | threading.Event | None] = Queue()
-        self._lost = 0
-        self._counting = threading.Lock()
+        self._lost = deque[None]()  # one for each lost line
         self._fault: StandingFault | None = None
         self._closed = path is None
         if path is not None:
@@ -65,7 +65,7 @@ class AuditLog:
         if self._closed:
             return
         if self._queue.qsize() >= WAITING:
-            self._count_lost(1)
+            self._lost.append(None)
         else:
             self._queue.put(record)
 
@@ -89,10 +89,6 @@ class AuditLog:
             self._queue.put(None)
             self._thread.join(timeout_s)
 
-    def _count_lost(self, lines: int) -> None:
-        with self._counting:
-            self._lost += lines
-
     # In the writing thread
 
     def _work(self) -> None:
@@ -103,16 +99,17 @@ class AuditLog:
                 self._write(entry)
 
     def _write(self, record: Mapping[str, Any]) -> None:
-        lost = self._lost
+        lost = len(self._lost)
         try:
             lines = [{"time": datetime.now(UTC).isoformat(), "lost": lost}] if lost else []
             self._append("".join(f"{_line(one)}\n" for one in (*lines, record)).encode())
         except Exception as error:  # the disk's, or of a record that cannot be written; the next one may be
-            self._count_lost(1)
+            self._lost.append(None)
             self._fail(error)
             return
         if lost:
-            self._count_lost(-lost)
+            for _ in range(lost):
+                self._lost.popleft()
             log.warning("the audit log is written again; %d lines are missing in it", lost)
         self._fault = None
 

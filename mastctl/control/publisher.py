@@ -24,7 +24,7 @@ import contextlib
 import itertools
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any, Literal, Self, TypeVar, get_args
@@ -60,25 +60,20 @@ class Subscription:
     """
 
     def __init__(
-        self,
-        topics: frozenset[Topic],
-        keys: frozenset[str] | None,
-        end: Callable[[Subscription], None],
-        every: bool = False,
+        self, publisher: Publisher, topics: frozenset[Topic], keys: frozenset[str] | None, every: bool
     ) -> None:
         self.lost = 0
         self.closed = False
+        self._publisher = publisher
         self._topics = topics
         self._keys = keys
-        self._end = end
         self._every = every
         self._most = MOST_UNREAD
-        self._lock = threading.Lock()  # for as long as a value is put in or all are handed over
         self._unread: dict[int | tuple[Topic, str], Published] = {}
 
     def close(self) -> None:
         """Receive no more; a reader that waits is woken."""
-        self._end(self)
+        self._publisher.leave(self)
         self.finish()
 
     def __enter__(self) -> Self:
@@ -92,17 +87,16 @@ class Subscription:
     # For the publisher
 
     def put(self, one: Published) -> None:
-        """Keep a value for the reader, in place of an older one of the same topic and key."""
+        """Keep a value for the reader, in place of an older one of the same topic and key; under the lock."""
         if one.topic not in self._topics or (self._keys is not None and one.key not in self._keys):
             return
         place = one.sequence if self._every else (one.topic, one.key)
-        with self._lock:
-            self.lost += self._unread.pop(place, None) is not None
-            if one.value is not GONE:
-                self._unread[place] = one
-            if len(self._unread) > self._most:
-                del self._unread[next(iter(self._unread))]
-                self.lost += 1
+        self.lost += self._unread.pop(place, None) is not None
+        if one.value is not GONE:
+            self._unread[place] = one
+        if len(self._unread) > self._most:
+            del self._unread[next(iter(self._unread))]
+            self.lost += 1
         if one.value is not GONE:
             self._wake()
 
@@ -115,7 +109,7 @@ class Subscription:
         raise NotImplementedError
 
     def _take_unread(self) -> list[Published]:
-        with self._lock:
+        with self._publisher.lock:
             unread, self._unread = self._unread, {}
         return sorted(unread.values(), key=lambda one: one.sequence)
 
@@ -123,11 +117,9 @@ class Subscription:
 class ThreadSubscription(Subscription):
     """A subscription that a thread waits on."""
 
-    def __init__(
-        self, topics: frozenset[Topic], end: Callable[[Subscription], None], every: bool = False
-    ) -> None:
+    def __init__(self, publisher: Publisher, topics: frozenset[Topic], every: bool) -> None:
         self._something = threading.Event()
-        super().__init__(topics, None, end, every)
+        super().__init__(publisher, topics, None, every)
 
     def wait(self, timeout_s: float | None = None) -> list[Published]:
         """Return what is new since the last call, oldest first; wait for it for ``timeout_s`` real seconds.
@@ -150,13 +142,11 @@ class ThreadSubscription(Subscription):
 class LoopSubscription(Subscription):
     """A subscription that a coroutine waits on, of the event loop on which it was made."""
 
-    def __init__(
-        self, topics: frozenset[Topic], keys: frozenset[str] | None, end: Callable[[Subscription], None]
-    ) -> None:
+    def __init__(self, publisher: Publisher, topics: frozenset[Topic], keys: frozenset[str] | None) -> None:
         self._loop = asyncio.get_running_loop()
         self._something = asyncio.Event()
         self._woken = False
-        super().__init__(topics, keys, end)
+        super().__init__(publisher, topics, keys, every=False)
 
     async def wait(self, timeout_s: float | None = None) -> list[Published]:
         """Return what is new since the last call, oldest first; wait for it for ``timeout_s`` seconds.
@@ -183,28 +173,31 @@ class LoopSubscription(Subscription):
 
 
 class Publisher:
-    """Hands each value to every listener; safe to use from any thread. Its lock waits for no listener."""
+    """Hands each value to every listener; safe to use from any thread.
+
+    ``lock`` is kept while a value is handed over or a listener takes its values; it waits for no listener.
+    """
 
     def __init__(self) -> None:
         self._numbers = itertools.count(1)
         self._newest: dict[tuple[Topic, str], Published] = {}
         self._subscriptions: tuple[Subscription, ...] = ()
         self._closed = False
-        self._lock = threading.RLock()
+        self.lock = threading.RLock()
 
     def publish(self, topic: Topic, key: str, value: Any) -> None:
         """Hand every listener of a topic the newest value of a key.
 
         Values reach each listener in the order in which they were published.
         """
-        with self._lock:
+        with self.lock:
             one = self._newest[topic, key] = Published(next(self._numbers), topic, key, value)
             for subscription in self._subscriptions:
                 subscription.put(one)
 
     def forget(self, topic: Topic, key: str) -> None:
         """Drop a key's value, for later listeners too: it is one of many, and old."""
-        with self._lock:
+        with self.lock:
             self._newest.pop((topic, key), None)
             for subscription in self._subscriptions:
                 subscription.put(Published(0, topic, key, GONE))
@@ -221,7 +214,7 @@ class Publisher:
         ``every`` no value takes another one's place and `forget` takes none back. Beyond ``MOST_UNREAD``
         unread values the oldest is lost, and counted in ``lost``.
         """
-        return self._added(ThreadSubscription(_checked(topics), self._leave, every), known)
+        return self._added(ThreadSubscription(self, _checked(topics), every), known)
 
     def subscribe_here(
         self, *topics: Topic, known: bool = True, keys: frozenset[str] | None = None
@@ -229,7 +222,7 @@ class Publisher:
         """Return a subscription for a coroutine of the running event loop, to some keys only if they are
         given; else as `subscribe`.
         """
-        return self._added(LoopSubscription(_checked(topics), keys, self._leave), known)
+        return self._added(LoopSubscription(self, _checked(topics), keys), known)
 
     @property
     def listeners(self) -> int:
@@ -238,14 +231,14 @@ class Publisher:
 
     def close(self) -> None:
         """End every subscription, and each that is made later; publishing goes nowhere from then on."""
-        with self._lock:
+        with self.lock:
             self._closed = True
             subscriptions, self._subscriptions = self._subscriptions, ()
         for one in subscriptions:
             one.finish()
 
     def _added(self, subscription: _Subscription, known: bool) -> _Subscription:
-        with self._lock:
+        with self.lock:
             if self._closed:
                 subscription.finish()
                 return subscription
@@ -254,8 +247,9 @@ class Publisher:
                 subscription.put(one)
         return subscription
 
-    def _leave(self, subscription: Subscription) -> None:
-        with self._lock:
+    def leave(self, subscription: Subscription) -> None:
+        """Drop a subscription."""
+        with self.lock:
             self._subscriptions = tuple(one for one in self._subscriptions if one is not subscription)
 
 

@@ -306,10 +306,11 @@ class Devices(Cameras):
         """
         try:
             self._stops.send(STOP_TIMEOUT_S)
-        except LineLost:
-            self._stop_lost = True
+        except BaseException as error:
+            self._stop_lost |= isinstance(error, LineLost)
+            self.fault_watch.check()  # the fault is published before the stop is over
             raise
-        finally:
+        if self._machine.standing.faults:
             self.fault_watch.check()
 
     def stops_returned(self, timeout_s: float) -> bool:

@@ -1,9 +1,8 @@
-"""How stops come in: by threads for the web side, and by a Unix socket that takes nothing else.
+"""A Unix socket that takes stops and nothing else, beside the web side and independent of it.
 
-The socket is independent of the web side. A client sends one line, ``stop`` or ``estop NAME: REASON``, and
-gets one line: what was done, or why it failed. Each connection has a thread of its own, so a silent one
-delays no other and no event loop is needed. Some descriptors are kept for it, so that it answers when the
-process has none left.
+A client sends one line, ``stop`` or ``estop NAME: REASON``, and gets one line: the answer, or why it failed.
+Each connection has a thread of its own, so a silent one delays no other and no event loop is needed. Some
+descriptors are kept for it, so that it answers when the process has none left.
 
 `request` sends such a line from another process; it needs no configuration that can be read.
 """
@@ -19,14 +18,11 @@ import socket
 import socketserver
 import threading
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future
+from collections.abc import Iterator
 from pathlib import Path
-from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol
 
-from drivers.clock import Clock, SystemClock
-from mastctl.errors import MastctlError, Unable, error_body
+from mastctl.errors import MastctlError, error_body
 from mastctl.safety.state_folder import DAEMON_FILE, DAEMON_SCHEMA, folders_of
 
 if TYPE_CHECKING:
@@ -34,10 +30,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-T = TypeVar("T")
-
-THREADS = 4
-OVERDUE_S = 1.5  # a stop is given 1 s by the devices
 FILE = "stop.sock"
 LONGEST_PATH = 100  # bytes; the kernel's own bound is 108
 LONGEST_LINE = 1024
@@ -45,68 +37,6 @@ SPARES = 8
 SILENT_S = 5.0
 POLL_S = 0.1  # how late the end is noticed
 ANSWER_S = 5.0
-
-
-class StopsHang(Unable):
-    """As many stops as there are threads have not come back; another one could not be sent."""
-
-    def __init__(self, message: str) -> None:
-        super().__init__("stop_pending", message)
-
-
-class StopThreads:
-    """Daemon threads that exist from the start and run stops alone; safe to use from any thread.
-
-    They wait for calls, never for ``clock``, by which a call is known to be overdue.
-    """
-
-    def __init__(self, threads: int = THREADS, clock: Clock | None = None) -> None:
-        self._threads = threads
-        self._clock = clock or SystemClock()
-        self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
-        self._began_s: dict[object, float] = {}  # of the calls under way
-        for number in range(threads):
-            threading.Thread(target=self._work, name=f"stop_{number}", daemon=True).start()
-
-    def submit(self, function: Callable[[], T]) -> Future[T]:
-        """Run a function in the next free thread and return its future result; returns at once.
-
-        Raises StopsHang if every thread has been in its call for longer than a stop may take.
-        """
-        now_s = self._clock.now_s()
-        under_way_s = [now_s - began_s for began_s in self._began_s.copy().values()]
-        if len(under_way_s) >= self._threads and min(under_way_s) > OVERDUE_S:
-            raise StopsHang(
-                f"{len(under_way_s)} stops are under way, the oldest for {max(under_way_s):.1f} s, and none "
-                "has come back; the head may still move: switch its power off"
-            )
-        future: Future[T] = Future()
-        future.set_running_or_notify_cancel()  # a caller that waits no longer does not cancel the stop
-
-        def call() -> None:
-            self._began_s[future] = self._clock.now_s()
-            result, failure = None, None
-            try:
-                result = function()
-            except BaseException as error:  # it belongs to the caller
-                failure = error
-            self._began_s.pop(future)
-            if failure is None:
-                future.set_result(result)  # type: ignore[arg-type]
-            else:
-                future.set_exception(failure)
-
-        self._calls.put(call)
-        return future
-
-    def close(self) -> None:
-        """Let the threads end after what is under way; does not wait."""
-        for _ in range(self._threads):
-            self._calls.put(None)
-
-    def _work(self) -> None:
-        while (call := self._calls.get()) is not None:
-            call()
 
 
 class StopHandlers(Protocol):

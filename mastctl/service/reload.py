@@ -45,16 +45,14 @@ def reload(service: Service) -> ReloadResult:
     ``restart_needed`` if it has something else of what cannot change; ``busy``, ``moving`` if something runs
     or the head moves; DriverError if the head does not say whether it moves.
     """
-    with service.reloading:
-        service.manager.reloading()
-        try:
-            return _reload(service)
-        finally:
-            service.manager.ready()
+    service.manager.reloading()
+    try:
+        return _reload(service)
+    finally:
+        service.manager.ready()
 
 
 def _reload(service: Service) -> ReloadResult:
-    """Reload; no other request does meanwhile."""
     before = service.config
     try:
         after = load_config(before.path)

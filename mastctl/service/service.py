@@ -45,10 +45,10 @@ from mastctl.recorder.writer import Attached
 from mastctl.safety import stop_socket
 from mastctl.safety.latch import Latch
 from mastctl.safety.state_folder import StateFolder, other_head_folders
-from mastctl.safety.stop_socket import StopSocket, StopThreads
+from mastctl.safety.stop_socket import StopSocket
 from mastctl.service.masts import MastInUse, Masts, configured, read_mast
 from mastctl.service.steering import Steering
-from mastctl.service.stopping import SocketStops, Stopping, state_faults
+from mastctl.service.stopping import SocketStops, Stopping, StopThreads, state_faults
 from mastctl.service_manager import ServiceManager
 from mastctl.watch.handoffs import HandoffCheck, line_of
 from mastctl.watch.journal import JournalThread
@@ -73,7 +73,7 @@ class Service:
 
     ``folder``, where state is kept, and the head's own folder ``head``, where its latch is kept (None for one
     in memory), are closed by `close`, the ``hardware`` too. ``machine`` states what the daemon is doing; its
-    publisher gets every change. ``reloading`` is locked while the configuration is read again.
+    publisher gets every change.
     """
 
     def __init__(
@@ -143,7 +143,6 @@ class Service:
         self.devices.fault_watch.also(self._own_faults)
         self.stop_socket: StopSocket | None = None
         self._socket_folder: StateFolder | None = None
-        self.reloading = threading.Lock()
         self.manager = ServiceManager({})
         self._closing = threading.Lock()
         self._closed = False

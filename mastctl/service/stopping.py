@@ -6,8 +6,12 @@ Nothing comes before the head: no log, no file, and no lock that is held for lon
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from queue import SimpleQueue
+from typing import TypeVar
 
+from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError
 from mastctl.answers import EstopTold, ResetTold, StopTold
 from mastctl.control.entry import ESTOP, STOP, CommandEntry, CommandRequest
@@ -24,6 +28,72 @@ from mastctl.safety.stop_socket import StopHandlers
 KEPT_S = 1.0  # what the disk is given before an emergency stop is answered without it
 STRAGGLER_S = 1.0  # what a reset waits for stops that follow one that was confirmed already
 STATE = "state"
+THREADS = 4
+OVERDUE_S = 1.5  # a stop is given 1 s by the devices
+
+T = TypeVar("T")
+
+
+class StopsHang(Unable):
+    """As many stops as there are threads have not come back; another one could not be sent."""
+
+    def __init__(self, message: str) -> None:
+        super().__init__("stop_pending", message)
+
+
+class StopThreads:
+    """Daemon threads that exist from the start and run stops alone; safe to use from any thread.
+
+    They wait for calls, never for ``clock``, by which a call is known to be overdue.
+    """
+
+    def __init__(self, threads: int = THREADS, clock: Clock | None = None) -> None:
+        self._threads = threads
+        self._clock = clock or SystemClock()
+        self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._began_s: dict[object, float] = {}  # of the calls under way
+        for number in range(threads):
+            threading.Thread(target=self._work, name=f"stop_{number}", daemon=True).start()
+
+    def submit(self, function: Callable[[], T]) -> Future[T]:
+        """Run a function in the next free thread and return its future result; returns at once.
+
+        Raises StopsHang if every thread has been in its call for longer than a stop may take.
+        """
+        now_s = self._clock.now_s()
+        under_way_s = [now_s - began_s for began_s in self._began_s.copy().values()]
+        if len(under_way_s) >= self._threads and min(under_way_s) > OVERDUE_S:
+            raise StopsHang(
+                f"{len(under_way_s)} stops are under way, the oldest for {max(under_way_s):.1f} s, and none "
+                "has come back; the head may still move: switch its power off"
+            )
+        future: Future[T] = Future()
+        future.set_running_or_notify_cancel()  # a caller that waits no longer does not cancel the stop
+
+        def call() -> None:
+            self._began_s[future] = self._clock.now_s()
+            result, failure = None, None
+            try:
+                result = function()
+            except BaseException as error:  # it belongs to the caller
+                failure = error
+            self._began_s.pop(future)
+            if failure is None:
+                future.set_result(result)  # type: ignore[arg-type]
+            else:
+                future.set_exception(failure)
+
+        self._calls.put(call)
+        return future
+
+    def close(self) -> None:
+        """Let the threads end after what is under way; does not wait."""
+        for _ in range(self._threads):
+            self._calls.put(None)
+
+    def _work(self) -> None:
+        while (call := self._calls.get()) is not None:
+            call()
 
 
 class Stopping:
@@ -45,7 +115,6 @@ class Stopping:
         self._tracker = tracker
         self._machine = machine
         self._latch = latch
-        self._resetting = threading.Lock()
         self._blocking = threading.Lock()
         self._block_moves()
 
@@ -139,11 +208,10 @@ class Stopping:
             raise refusal
         if not self._devices.stops_returned(STRAGGLER_S):
             raise NotNow("stopping", "the mast is being stopped; an emergency stop is released after that")
-        with self._resetting:
-            causes = self._latch.release(reason, name)
-            self._block_moves()
-            self._machine.reset(name, reason, lambda: self._latch.entries)
-            return {"latched": bool(self._latch.entries), "released": causes[0].as_json()}
+        causes = self._latch.release(reason, name)
+        self._block_moves()
+        self._machine.reset(name, reason, lambda: self._latch.entries)
+        return {"latched": bool(self._latch.entries), "released": causes[0].as_json()}
 
     def _block_moves(self) -> None:
         """Refuse moves while anything is latched; after each change of the latch, and in turn."""

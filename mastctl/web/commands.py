@@ -18,8 +18,8 @@ from mastctl.control.lease import Caller, client_name
 from mastctl.errors import Unable
 from mastctl.http import PREFIX
 from mastctl.motion.requests import DeadlineS
-from mastctl.safety.stop_socket import StopsHang
 from mastctl.service.service import Service
+from mastctl.service.stopping import StopsHang
 from mastctl.web.parts import Here, Parts
 
 T = TypeVar("T")

@@ -53,9 +53,9 @@ from mastctl.http import PREFIX
 from mastctl.motion.jog import JogBeat
 from mastctl.motion.requests import PointingError, PointRequest, TrackRequest
 from mastctl.safety.latch import LONGEST
-from mastctl.safety.stop_socket import StopsHang
 from mastctl.service.service import Service
 from mastctl.service.steering import usual_s
+from mastctl.service.stopping import StopsHang
 from mastctl.web.commands import Asks, carried_out, command, stop_first
 from mastctl.web.models import (
     EstopBody,

@@ -8,7 +8,7 @@ import pytest
 
 from drivers.clock import ManualClock
 from hil_tests.waiting import NET_S, until
-from mastctl.safety.stop_socket import OVERDUE_S, StopsHang, StopThreads
+from mastctl.service.stopping import OVERDUE_S, StopsHang, StopThreads
 
 
 def test_a_stop_is_refused_only_when_every_thread_is_overdue() -> None:

@@ -20,7 +20,7 @@ from hil_tests.waiting import NET_S, joined, present, until
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.motion.loop import PointingLoop
-from mastctl.safety import stop_socket as stop_socket_module
+from mastctl.service import stopping as stopping_module
 from mastctl.web import commands as commands_module
 
 
@@ -124,7 +124,7 @@ def test_a_fifth_stop_is_answered_honestly_while_four_hang(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     hang = Hang()
-    monkeypatch.setattr(stop_socket_module, "OVERDUE_S", 0.2)
+    monkeypatch.setattr(stopping_module, "OVERDUE_S", 0.2)
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
         monkeypatch.setattr(commands_module, "STOP_ANSWER_S", 0.5)
         monkeypatch.setattr(daemon.service.stopping, "stop", hang)
