@@ -31,11 +31,7 @@ from calib.geometry.cahvor import CameraModel, Kind
 from calib.geometry.rigid import unit_vector
 
 UNKNOWN_FRAME = "unknown"
-#: No component of a camera model or a mast is larger; beyond it the arithmetic would overflow.
-LARGEST_COMPONENT = 1e9
 LARGEST_IMAGE_PX = 65536
-#: A lens with no ray in more than this part of its image is refused; a fisheye's corners often have none.
-MOST_BLIND = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +266,7 @@ def build_model(
 
     arrays = {letter: np.asarray(vector, dtype=np.float64) for letter, vector in vectors.items()}
     for letter, array in arrays.items():
-        if not (np.isfinite(array).all() and (np.abs(array) <= LARGEST_COMPONENT).all()):
+        if not (np.abs(array) <= 1e9).all():  # beyond, the arithmetic would overflow
             raise BadFile(path, at(letter), f"{array.tolist()} where finite numbers up to 1e9 are expected")
     for letter in "AO":
         if letter in arrays and np.linalg.norm(arrays[letter]) < 1e-6:
@@ -328,7 +324,7 @@ def blind_notes(model: CameraModel, path: str | Path, place: str) -> tuple[str, 
     except ValueError as problem:
         raise BadFile(path, place, f"is no usable camera: {problem}") from None
     why = model.limit_reason or "the lens looks sideways"
-    if blind > MOST_BLIND:
+    if blind > 0.5:  # a fisheye's corners often have none
         raise BadFile(path, place, f"{100 * blind:.0f} %, more than half of the image has no ray: {why}")
     where = f"{place}: " if place else ""
     return (f"{where}{100 * blind:.2g} % of the image has no ray: {why}",) if blind else ()

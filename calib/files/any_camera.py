@@ -42,14 +42,6 @@ from calib.files.twin import (
 )
 from calib.geometry.cahvor import FREE, CameraModel, Kind
 
-KNOWN_FORMATS = (
-    "a mast file, a camera file, a .cahvor file, OpenCV's YAML, XML or JSON, ROS's "
-    "camera_info, Kalibr's camchain or mrcal's .cameramodel"
-)
-
-MAX_FILE_BYTES = 1 << 28
-"""mrcal keeps all its measurements in a camera's file."""
-
 LIMIT_PX = 0.25
 """A conversion that moves a pixel by more than this is refused unless the caller sets another limit."""
 
@@ -91,7 +83,7 @@ def load_any(path: str | Path) -> StoredRig | CameraFile | dict[str, CameraFile]
     The content shows the format. Where it does not, the suffix decides which format's refusal helps most.
     Raises BadFile if the file is none of these, or is one but malformed.
     """
-    data = read_bytes(path, MAX_FILE_BYTES)
+    data = read_bytes(path, 1 << 28)  # mrcal keeps all its measurements in a camera's file
     suffix = Path(path).suffix.lower()
     if looks_like_mrcal(data) or suffix == ".cameramodel":
         return parse_mrcal(data, path)
@@ -114,7 +106,10 @@ def load_any(path: str | Path) -> StoredRig | CameraFile | dict[str, CameraFile]
         return parse_cahvor(data, path)
     if refusal is not None and (looks_like_storage(data) or suffix in (".yaml", ".yml", ".xml", ".json")):
         raise refusal
-    raise BadFile(path, "", f"is not one of these formats: {KNOWN_FORMATS}")
+    known = (
+        "a mast file, a camera file, a .cahvor file, OpenCV's YAML, XML or JSON, ROS's camera_info, Kalibr's "
+    )
+    raise BadFile(path, "", f"is not one of these formats: {known}camchain or mrcal's .cameramodel")
 
 
 @dataclass(frozen=True)

@@ -37,9 +37,6 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.lenses import opencv
 from calib.geometry.rigid import FloatArray, Rigid
 
-CAMERA_FRAME = "camera"
-"""The frame of a file that holds no pose: the camera's own, x right, y down, z ahead."""
-
 LensName = Literal[
     "plumb_bob",
     "rational_polynomial",
@@ -273,7 +270,7 @@ class CalibrationRecord(Record):
     binning_x: _Binning = 0
     binning_y: _Binning = 0
     camera_from_frame: Matrix44 = Field(default=ABSENT)
-    frame: Text = CAMERA_FRAME
+    frame: Text = "camera"  # its own, x right, y down, z ahead, where the file holds no pose
 
     @model_validator(mode="after")
     def _names_one_lens(self) -> CalibrationRecord:

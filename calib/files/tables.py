@@ -23,8 +23,6 @@ from calib.files import read_bytes, text_of
 from calib.files.yaml_text import nearest
 from calib.geometry.rigid import FloatArray
 
-MAX_BYTES = 1 << 29
-
 NUMBER = re.compile(
     r"[-+]?(?:(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?|inf|infinity|nan)", re.IGNORECASE
 )
@@ -37,7 +35,7 @@ def read_table(path: str | Path, columns: Sequence[str]) -> FloatArray:
     Raises BadFile for another header, a row of another length, or a cell that is not a number. The place is
     the row, counted from 1 after the header, and the line of the file.
     """
-    return parse_table(read_bytes(path, MAX_BYTES), path, columns)
+    return parse_table(read_bytes(path, 1 << 29), path, columns)
 
 
 def parse_table(data: bytes, path: str | Path, columns: Sequence[str]) -> FloatArray:

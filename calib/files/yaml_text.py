@@ -22,7 +22,6 @@ from calib.files import text_of
 
 MAX_BYTES = 4_000_000
 MAX_DEPTH = 16
-_MAX_DIGITS = 400
 
 _INT = re.compile(r"[-+]?[0-9]+")
 _FLOAT = re.compile(r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?")
@@ -34,8 +33,6 @@ _CONSTANTS: dict[str, Any] = {
     **dict.fromkeys((".nan", ".NaN", ".NAN"), float("nan")),
 }
 
-_PARSER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-
 
 def parse_mapping(data: bytes, path: str | Path) -> dict[str, Any]:
     """Return the one mapping that UTF-8 bytes hold: str keys; dict, list, str, int, float, bool, None inside.
@@ -46,7 +43,9 @@ def parse_mapping(data: bytes, path: str | Path) -> dict[str, Any]:
         raise BadFile(path, "", f"is larger than {MAX_BYTES} bytes, the most that is read")
     text = text_of(data, path)
     try:
-        document = _Builder(yaml.parse(text, Loader=_PARSER), path).document()
+        document = _Builder(
+            yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)), path
+        ).document()
     except yaml.YAMLError as error:
         raise BadFile(path, _line_of(error), f"is not YAML: {_problem_of(error)}") from None
     if not isinstance(document, dict):
@@ -126,7 +125,7 @@ def _scalar(event: Any, path: str | Path) -> Any:
     if text in _CONSTANTS:
         return _CONSTANTS[text]
     if _INT.fullmatch(text):
-        if len(text) > _MAX_DIGITS:
+        if len(text) > 400:
             raise BadFile(path, _line(event), f"a number of {len(text)} digits")
         return int(text)
     return float(text) if _FLOAT.fullmatch(text) else text

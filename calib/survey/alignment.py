@@ -21,9 +21,6 @@ from calib.geometry.rigid import FloatArray, Rigid, rigid_rates
 from calib.geometry.significance import Level
 from calib.survey.records import Survey
 
-ON_A_LINE = 1e-3
-"""Points are on one line if they spread less across it than so much of their spread along it."""
-
 
 class NotAligned(CalibError):
     """Points that no pose follows from: fewer than three, or on one line."""
@@ -186,7 +183,7 @@ def _pose(a: FloatArray, b: FloatArray, sigma: FloatArray, names: Sequence[str])
     from_a, from_b = a - middle_a, b - middle_b
     for points in (from_a, from_b):
         spread = np.linalg.svd(points, compute_uv=False)
-        if not spread[1] > ON_A_LINE * spread[0]:
+        if not spread[1] > 1e-3 * spread[0]:  # across the line, and along it
             raise NotAligned(f"the points {', '.join(names)} stand on one line, or in one place")
     u, _, vt = np.linalg.svd(from_b.T @ (weight[:, None] * from_a))
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt

@@ -25,9 +25,6 @@ from calib.survey.records import Survey, SurveyFinding, SurveyImage
 FEWEST_BOARDS, ENOUGH_BOARDS = 3, 5
 """For a camera, and for the mast; the paper finds 5 to 8 positions adequate."""
 
-WANTED_RAD = {"pan": 0.5, "tilt": 0.2}
-MOST_RAD = {"pan": np.pi, "tilt": np.pi / 2}
-
 
 def check_survey(survey: Survey, *, only_camera_images: bool = False) -> tuple[SurveyFinding, ...]:
     """Return what is missing, too little, or at odds with itself in a survey; errors first.
@@ -166,7 +163,7 @@ def _placements(survey: Survey) -> Iterator[SurveyFinding]:
 
 def _angles(survey: Survey) -> Iterator[SurveyFinding]:
     """Joint angles that no head has; many of them are degrees."""
-    for joint, most in MOST_RAD.items():
+    for joint, most in (("pan", np.pi), ("tilt", np.pi / 2)):
         angles = [(getattr(i, f"{joint}_rad"), i) for i in survey.images if i.pan_rad is not None]
         off = [(angle, image) for angle, image in angles if not abs(angle) <= most]
         if not off:
@@ -230,8 +227,8 @@ def _mast_spread(survey: Survey) -> Iterator[SurveyFinding]:
             "Turn the head to five to eight boards over the range of pan and tilt, with purpose mast",
         )
         return
-    for (joint, wanted), found, column in zip(WANTED_RAD.items(), (pan_rad, tilt_rad), joints.T, strict=True):
-        if found < wanted:
+    for joint, wanted, column in (("pan", 0.5, joints[:, 0]), ("tilt", 0.2, joints[:, 1])):
+        if (found := float(np.ptp(column))) < wanted:
             yield SurveyFinding(
                 "warning",
                 "the mast",

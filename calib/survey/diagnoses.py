@@ -19,9 +19,6 @@ from calib.survey.alignment import Alignment, NotAligned, align, mirrored, poses
 from calib.survey.records import Survey, SurveyCamera, SurveyFinding, SurveyImage
 from calib.targets.boards import Dots
 
-UNITS = {"feet": 3.28084, "inches": 39.3701, "centimetres": 100.0, "millimetres": 1000.0}
-"""How many of them a metre has."""
-
 SCALE = 0.03
 """Distances that differ from the design's by more than this in the median are no noise."""
 
@@ -139,7 +136,8 @@ def _ratio(design: Mapping[str, FloatArray], groups: Iterable[Mapping[str, Float
 
 def _as_unit(ratio: float, measured: str, designed: str) -> str:
     """Say which unit a ratio comes from, if it is a known one."""
-    for unit, in_metre in UNITS.items():
+    in_a_metre = {"feet": 3.28084, "inches": 39.3701, "centimetres": 100.0, "millimetres": 1000.0}
+    for unit, in_metre in in_a_metre.items():
         if abs(ratio / in_metre - 1) < SCALE:
             return f": {measured} in {unit}"
         if abs(ratio * in_metre - 1) < SCALE:
@@ -217,13 +215,8 @@ def pixels_per_metre(survey: Survey, dots: Dots) -> float | None:
     return None if spread is None else float(np.linalg.norm(spread, 2))
 
 
-CAMERA_OFF_M, ROUGH_OFF_M = 1.0, 0.25
-"""How far a camera may be from where it is assumed: the middle of the prisms, or its rough place."""
-
 SIZE = 1.45
 """How much lens, lean and focal length may change the size of a board."""
-
-Placement = tuple[str, str]
 
 
 class BoardBearing(NamedTuple):
@@ -261,7 +254,7 @@ def mixups(survey: Survey) -> Iterator[SurveyFinding]:
         yield from _camera_mixups(survey, survey.cameras[name], mine)
 
 
-def _rover_from_boards(survey: Survey) -> dict[Placement, Rigid]:
+def _rover_from_boards(survey: Survey) -> dict[tuple[str, str], Rigid]:
     """Where boards are, by set-up and placement; nothing is left out that does not fit."""
     rover, boards = poses(survey, "prism", 0.0), poses(survey, "tape", 0.0)
     return {
@@ -281,7 +274,7 @@ def _cameras_in_rover_m(survey: Survey) -> dict[str, FloatArray]:
 
 
 def _facing_away(
-    boards: Mapping[Placement, Rigid], cameras_m: Mapping[str, FloatArray]
+    boards: Mapping[tuple[str, str], Rigid], cameras_m: Mapping[str, FloatArray]
 ) -> Iterator[SurveyFinding]:
     """Yield boards that turn their back on the rover."""
     middle_m = np.mean(list(cameras_m.values()), axis=0)
@@ -301,7 +294,8 @@ def _facing_away(
 
 
 def _camera_mixups(survey: Survey, camera: SurveyCamera, mine: list[BoardBearing]) -> Iterator[SurveyFinding]:
-    off_m = CAMERA_OFF_M if camera.rough_C_m is None else ROUGH_OFF_M
+    # how far it may be from where it is assumed: the middle of the prisms, or its rough place
+    off_m = 1.0 if camera.rough_C_m is None else 0.25
     seen, sizes = [], []
     for sight in mine:
         dots = survey.dots.get(sight.image.name)
@@ -366,10 +360,6 @@ def _reach_rad(camera: SurveyCamera, image: SurveyImage, range_m: float, off_m: 
     return across + float(np.arcsin(min(1.0, 1.5 * off_m / range_m))) + 0.15
 
 
-STILL_RAD = 0.1
-"""A spread so small says nothing: boards stand anywhere in the picture."""
-
-
 def joint_mixups(survey: Survey) -> Iterator[SurveyFinding]:
     """Yield one error if pan and tilt, with another sign or exchanged, look far better at the boards."""
     # Of the images for which the head was turned to the board; those for the camera show it in corners.
@@ -395,7 +385,8 @@ def joint_mixups(survey: Survey) -> Iterator[SurveyFinding]:
         best = [min(((axis, 1), (axis, -1)), key=spreads[axis].__getitem__) for axis in (0, 1)]
     given = [spreads[axis][axis, 1] for axis in (0, 1)]
     better = [spreads[axis][best[axis]] for axis in (0, 1)]
-    wrong = [g > STILL_RAD and b < 0.6 * g for g, b in zip(given, better, strict=True)]
+    # a spread of 0.1 rad says nothing: boards stand anywhere in the picture
+    wrong = [g > 0.1 and b < 0.6 * g for g, b in zip(given, better, strict=True)]
     if best[0][0] == 1:
         faults = ["pan_rad and tilt_rad are exchanged"] if all(wrong) else []
     else:

@@ -24,9 +24,7 @@ from calib.survey.records import Survey, SurveyCamera, SurveyImage
 from calib.targets.boards import Board, CornersNotFound, Dots
 from calib.targets.dots import PredictedBoard, Upright, find_dots
 
-AHEAD = np.array([1.0, 0.0, 0.0])
 DOWN = np.array([0.0, 0.0, 1.0])
-CAMERA_FROM_CARRIER = Rigid(np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]), np.zeros(3))
 
 Progress = Callable[[int, int, str], None]
 """Called with how many images are done, of how many, and the name of the last."""
@@ -136,8 +134,9 @@ def expectations(survey: Survey) -> dict[str, PredictedBoard | Upright | None]:
         if camera.rough_C_m is None or camera.rough_A is None:
             down = rover_from_board.inverse.vectors(turn @ DOWN)
             # A body camera looks down as well, but its picture's down is nearest to the rover's.
-            upright = _rough_model(camera, np.zeros(3), AHEAD, np.eye(3), np.eye(3))
-            expected[image.name] = Upright(upright.moved(CAMERA_FROM_CARRIER), down)
+            upright = _rough_model(camera, np.zeros(3), np.array([1.0, 0.0, 0.0]), np.eye(3), np.eye(3))
+            camera_from_carrier = Rigid(np.eye(3)[[1, 2, 0]], np.zeros(3))
+            expected[image.name] = Upright(upright.moved(camera_from_carrier), down)
         else:
             turned = turn @ _head_turn(first[image.camera], camera).T
             C = pivot + turned @ (camera.rough_C_m - pivot) if camera.on == "head" else camera.rough_C_m

@@ -47,12 +47,8 @@ APPROACH_COLUMNS = ("pan_approach", "tilt_approach")
 CORNER_COLUMNS = ("image", "board", "id", "x_px", "y_px")
 SIGMA_COLUMN = "sigma_px"
 
-MAX_ROWS, CSV_MAX_BYTES = 2_000_000, 200_000_000
-EDGE_PX = 1.0
-"""How far outside its image a dot or corner may have been found: noise at the border."""
-
-FURTHEST_M, LARGEST_ANGLE_RAD, WORST_SIGMA_PX = 1e5, 1e4, 100.0
-"""Beyond these a number is not a measurement; the check of the survey judges unlikely ones."""
+FURTHEST_M = 1e5
+"""Beyond it a number is not a measurement; the check of the survey judges unlikely ones."""
 
 SMALLEST_SIGMA = 1e-9
 """What is stated as exacter, and not as exact, leaves nothing of a float where sigmas are squared."""
@@ -287,12 +283,12 @@ class SurveyFolder:
         path = self.path / name
         if not required and not path.exists():
             return
-        rows = csv_rows(text_of(self._bytes_of(name, CSV_MAX_BYTES), path), path)
+        rows = csv_rows(text_of(self._bytes_of(name, 200_000_000), path), path)
         header = check_header(next(rows, (1, []))[1], path, columns, may_be_there)
         line = 0
         for line, cells in rows:
-            if line > MAX_ROWS:
-                raise BadFile(path, "", f"has more than {MAX_ROWS} lines, the most that is read")
+            if line > 2_000_000:
+                raise BadFile(path, "", "has more than 2000000 lines, the most that is read")
             yield line, TableRow(path, f"line {line}", header, cells)
         if required and not line:
             raise BadFile(path, "", f"has a header and no rows; one for each of {required} is expected")
@@ -396,7 +392,7 @@ def _joint_rad(row: TableRow, column: str, camera: SurveyCamera) -> float | None
         return None
     if not row.cells[column]:
         raise row.bad(column, f"is empty; {camera.name} is on the head and needs the measured angle")
-    return row.number(column, LARGEST_ANGLE_RAD)
+    return row.number(column, 1e4)
 
 
 def _refuse_on_body(row: TableRow, column: str, camera: SurveyCamera) -> None:
@@ -410,7 +406,7 @@ def _pixel(row: TableRow, camera: SurveyCamera) -> tuple[float, float]:
     """Read ``x_px`` and ``y_px``, which must be inside the camera's image."""
     pixel = row.number("x_px", 1e9), row.number("y_px", 1e9)
     for column, value, size in zip(("x_px", "y_px"), pixel, camera.size_px, strict=True):
-        if not -0.5 - EDGE_PX <= value <= size - 0.5 + EDGE_PX:
+        if not -1.5 <= value <= size + 0.5:  # noise at the border: a pixel beyond it
             shape = "x".join(map(str, camera.size_px))
             raise row.bad(column, f"{value:g} is outside the image of {camera.name}, {shape} pixels")
     return pixel
@@ -450,7 +446,7 @@ def _corners(
         once(row, f"corner {number} of image {image.name}", image.name, number)
         pixel, sigma_px = _pixel(row, cameras[image.camera]), corner_px
         if row.cells.get(SIGMA_COLUMN):
-            sigma_px = row.number(SIGMA_COLUMN, WORST_SIGMA_PX)
+            sigma_px = row.number(SIGMA_COLUMN, 100.0)
             if sigma_px <= 0:
                 raise row.bad(SIGMA_COLUMN, f"{sigma_px:g} where a number above 0 is expected")
         found.setdefault(image.name, []).append((number, *pixel, sigma_px))

@@ -45,12 +45,8 @@ from calib.targets.saddles import NO_SADDLES, Crossings, Saddles, fit_saddles
 MOST_ELSEWHERE = 0.5
 """Of the markers found; if more do not stand as on the board, it is another."""
 
-OTHERS = (
-    ("DICT_4X4_1000", 1), ("DICT_5X5_1000", 1), ("DICT_6X6_1000", 1), ("DICT_7X7_1000", 1),
-    ("DICT_ARUCO_ORIGINAL", 1), ("DICT_APRILTAG_36h11", 1), ("DICT_APRILTAG_36h11", 2),
-)  # fmt: skip
-BLURRED_PX, SMEARED, SMOOTH_PX = 2.0, 2.0, 1.0
-"""Standard deviation of a blur that is stated; of one direction against the other; of the smoothing."""
+BLURRED_PX = 2.0
+"""Standard deviation of a blur that is stated."""
 
 
 def doubled(board: MarkerBoard, markers: Markers, placed: PlacedMarkers | None) -> str:
@@ -125,16 +121,16 @@ def _mirrored(board: MarkerBoard, image: Grey8) -> str:
 
 def _blurred(image: Grey8) -> str:
     """Say over how many pixels the sharpest edges of a picture are spread, if that is too much."""
-    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), SMOOTH_PX)
+    smooth = cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.0)
     range_dn = float(np.ptp(np.percentile(smooth, (1.0, 99.5))))
     widths = []
     for axis in (1, 0):
         steepest = float(np.percentile(np.abs(np.gradient(smooth, axis=axis)), 99.8))
         # an edge blurred by a normal distribution is steepest in its middle
         spread = range_dn / max(steepest, 1e-6) / np.sqrt(2 * np.pi)
-        widths.append(float(np.sqrt(max(spread**2 - SMOOTH_PX**2, 0.0))))
+        widths.append(float(np.sqrt(max(spread**2 - 1.0, 0.0))))
     across, down = widths
-    if max(widths) > BLURRED_PX and max(widths) > SMEARED * min(widths):
+    if max(widths) > BLURRED_PX and max(widths) > 2.0 * min(widths):
         direction = "across" if across > down else "down"
         wide = f"its sharpest edges that way are spread over {2 * max(widths):.0f} px"
         return f"no board can be read; the picture moved {direction} during its exposure: {wide}"
@@ -148,7 +144,8 @@ def _others(board: MarkerBoard, image: Grey8) -> str:
     """Markers of another dictionary."""
     mine = board.dictionary if isinstance(board, Charuco) else FAMILIES[board.family]
     border = board.border if isinstance(board, AprilGrid) else 1
-    for dictionary, width in OTHERS:
+    others = [*(f"DICT_{n}X{n}_1000" for n in (4, 5, 6, 7)), "DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11"]
+    for dictionary, width in [*((other, 1) for other in others), (others[-1], 2)]:
         if (dictionary.split("_")[:2], width) == (mine.split("_")[:2], border):
             continue
         found = search(image, dictionary, width)
@@ -162,9 +159,6 @@ def _some(numbers: list[int]) -> str:
     first = ", ".join(map(str, sorted(numbers)[:4]))
     return first + (f" and {len(numbers) - 4} more" if len(numbers) > 4 else "")
 
-
-FARTHEST_PX = 4.0
-"""A corner is looked for so far from where the markers say that it is."""
 
 FEWEST = 4
 
@@ -241,7 +235,7 @@ def _fitted(
     while len(start.ids):
         tried[start.ids] = True
         crossings = printed.some(start.ids)
-        more = fit_saddles(levels, crossings, start.pixels_px, start.jacobians, FARTHEST_PX)
+        more = fit_saddles(levels, crossings, start.pixels_px, start.jacobians, farthest_px=4.0)
         found = Saddles._make(map(np.concatenate, zip(found, more, strict=True)))
         found = found.some(_good(found))
         if len(found.ids) < FEWEST or tried.all():

@@ -27,9 +27,6 @@ from calib.geometry.rigid import FloatArray, IntArray
 from calib.targets.boards import CornersNotFound, DotBoard, Grey8
 from calib.targets.dot_middles import centred
 
-TERMS = {10: 40, 21: 90}
-"""Of the polynomial, of degree 3 and 5, and for how many dots."""
-
 
 @dataclass(frozen=True, eq=False)
 class PlaneMap:
@@ -95,7 +92,7 @@ def fit_plane_map(points_m: FloatArray, pixels_px: FloatArray) -> PlaneMap | Non
     back = np.array([[1.0, 0.0, middle[0]], [0.0, 1.0, middle[1]], [0.0, 0.0, 1.0]])
     whole = np.asarray(back @ H @ np.diag([1 / scale, 1 / scale, 1.0]), dtype=np.float64)
     flat = PlaneMap(whole, np.empty((0, 2)), scale)
-    terms = max((terms for terms, least in TERMS.items() if len(points_m) >= least), default=0)
+    terms = 21 if len(points_m) >= 90 else 10 if len(points_m) >= 40 else 0  # of degree 5 and 3
     if not terms:
         return flat
     powers = _powers(points_m / scale, terms)
@@ -110,7 +107,6 @@ def _powers(points: FloatArray, terms: int) -> FloatArray:
 
 
 WIDEST_RATIO = 3.5  # major to minor axis: a board seen more flatly has dots that cannot be distinguished
-FILL = (0.80, 1.15)  # area over the area of the ellipse with the same second moments
 UNEVEN = 0.22  # spread of the ring of paper, in units of its contrast to the dot
 UNEVEN_AT_MOST = 0.4  # the same where the strict search found no grid
 RING_POINTS = 16
@@ -186,7 +182,7 @@ def _ellipses(labels: NDArray[np.int32], wanted: NDArray[np.int64], count: int) 
     )
     spread = np.sqrt(np.maximum((xx + yy) ** 2 / 4 - root**2, 0.0))
     flat = np.sqrt(((xx + yy) / 2 + spread) / np.maximum((xx + yy) / 2 - spread, 1e-9))
-    good = (fill > FILL[0]) & (fill < FILL[1]) & (flat < WIDEST_RATIO)
+    good = (fill > 0.80) & (fill < 1.15) & (flat < WIDEST_RATIO)
     return Candidates(np.stack([mx, my], axis=-1), shapes).some(good)
 
 
@@ -219,7 +215,6 @@ def contrasts(smooth: Grey8, middles_px: FloatArray, shapes_px: FloatArray) -> t
 
 
 NEAR = 0.35  # how far a neighbour may be from where it is expected, in spacings
-SIZES = (0.5, 2.0)  # areas of neighbours, one to the other
 
 
 class Lattice(NamedTuple):
@@ -263,7 +258,7 @@ def _links(found: Candidates, spacing_over_radius: float) -> list[list[int]]:
     area = np.abs(np.linalg.det(found.shapes_px))
     ratio = area[near] / area[:, None]
     off = np.abs(np.array(steps) - 1.0).max(axis=0)
-    good = (off < NEAR) & (ratio > SIZES[0]) & (ratio < SIZES[1])
+    good = (off < NEAR) & (ratio > 0.5) & (ratio < 2.0)
     return [near[i][good[i]].tolist() for i in range(count)]
 
 

@@ -23,14 +23,7 @@ from scipy.special import ndtr
 from calib.geometry.rigid import FloatArray
 from calib.targets.boards import Grey8, Levels
 
-REACH = 2.0
-"""How far the fit looks, in dot radii: neighbours begin at 3 and are blurred."""
-
-BLURS = 5.0
-"""How far beyond the outline the fit looks, in blurs or pixels, for dots large enough."""
-
 PARAMETERS = 8
-BOUNDARY_POINTS = 32
 
 
 class DotCentres(NamedTuple):
@@ -134,7 +127,8 @@ def _patches(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return u (n, p, 2), pixels from the middle; grey levels (n, p); weights (n, p), 0 or 1."""
     lengths = np.linalg.svd(shapes_px, compute_uv=False)
-    reach = np.minimum(REACH, 1.0 + BLURS / lengths[:, 1])
+    # in dot radii, of which neighbours begin at 3 and are blurred; of a large dot five pixels or blurs beyond
+    reach = np.minimum(2.0, 1.0 + 5.0 / lengths[:, 1])
     half = int(np.ceil((reach * lengths[:, 0]).max()))
     stride = max(1, -(-(2 * half + 1) // 60))  # of a large dot every second pixel will do, or every third
     u, levels, inside = windows(image, middles_px, half, stride)
@@ -220,7 +214,7 @@ def bias_through(
     metres. Not-a-number where the map has no pixel for some point of the boundary.
     """
     centres = np.asarray(centres_m, dtype=np.float64)
-    angle = np.arange(BOUNDARY_POINTS) * (2.0 * np.pi / BOUNDARY_POINTS)
+    angle = np.arange(32) * (2.0 * np.pi / 32)
     around = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     boundaries = pixel_of(centres[:, None, :] + around)
     return np.asarray(area_centroids(boundaries) - pixel_of(centres))

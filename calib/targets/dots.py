@@ -32,24 +32,14 @@ from calib.targets.dot_grid import (
 )
 from calib.targets.dot_middles import bias_through, fit_ellipses
 
-UNSURE = "the grid is found but not which corner is the first: it stands aslant against"
 SMALLEST_DOT_PX = 3.5
 
 SURE_RAD = np.radians(32.0)
 """The nearest order is taken if it is off by less than this; the next is then 58 degrees off or more."""
 
-STEEPEST = 0.3
-"""A camera that looks down so steeply that less than this of the vertical is in its image shows nothing."""
-
 PREDICTED_WITHIN_M = 0.25
 PREDICTED_WITHIN_RAD = np.radians(12.0)
 """How wrong a prediction may be: rough cameras are good to 20 cm and 10 degrees."""
-
-SIZE_WITHIN = 0.12
-"""Relative error of the rough focal length, and what threshold and blur do to a spot's width."""
-
-DIAMETERS_PX = (7.0, 12.0, 20.0, 34.0, 58.0, 100.0)
-"""Widths of dots looked for where nothing is predicted, each good for dots down to half of it."""
 
 
 def find_dots(
@@ -85,7 +75,10 @@ def find_dots(
         if isinstance(grid, BoardGrid):
             ordered = _ordered(grid, board, expected, steps_px)
             result = (
-                CornersNotFound(f"{UNSURE} {'the upright' if steps_px is None else 'the predicted pose'}")
+                CornersNotFound(
+                    "the grid is found but not which corner is the first: it stands aslant against "
+                    + ("the upright" if steps_px is None else "the predicted pose")
+                )
                 if ordered is None
                 else _measured(levels, board, grid, ordered)
             )
@@ -232,7 +225,7 @@ def order_by_gravity(
             continue
         U, _, Vt = np.linalg.svd(np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])]))
         down = U @ Vt @ down_in_board
-        if np.hypot(down[0], down[1]) < STEEPEST:
+        if np.hypot(down[0], down[1]) < 0.3:  # so little of the vertical in the image shows nothing
             continue
         turned = float(np.arctan2(-down[0], down[1]))
         orders.append(Ordered(columns, rows, turned))
@@ -334,7 +327,7 @@ def searches(image: Grey8, board: DotBoard, expected: PredictedBoard | Upright |
             yield DotSearch(box, size, UNEVEN)
             diameter, (least, most) = size
             yield DotSearch(whole, (1.25 * diameter, (0.5 * least, 2.0 * most)), UNEVEN_AT_MOST)
-    for diameter in DIAMETERS_PX:
+    for diameter in (7.0, 12.0, 20.0, 34.0, 58.0, 100.0):  # each good for dots down to half of it
         yield DotSearch(whole, (diameter, (0.12 * diameter**2, 1.2 * diameter**2)), UNEVEN)
 
 
@@ -352,7 +345,8 @@ def _predicted_search(
     shapes = jacobian[valid] @ pose.rotation[:, :2] * (board.dot_diameter_m / 2)
     lengths = np.linalg.svd(shapes, compute_uv=False)
     range_m = float(np.linalg.norm(dots - camera.C, axis=-1).min())
-    near = 1.0 + PREDICTED_WITHIN_M / max(range_m, 2 * PREDICTED_WITHIN_M) + SIZE_WITHIN
+    # 0.12: the error of the rough focal length, and what threshold and blur do to a spot's width
+    near = 1.0 + PREDICTED_WITHIN_M / max(range_m, 2 * PREDICTED_WITHIN_M) + 0.12
     tilt = 1.3  # the board's tilt against the line of sight is wrong by the angle that the camera is
     areas = np.pi * lengths[:, 0] * lengths[:, 1]
     size = (

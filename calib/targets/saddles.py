@@ -30,10 +30,7 @@ PARAMETERS = 11
 X, Y, SLANTS, BLURS, LIGHT, SLOPES, CONTRAST, TOGETHER = 0, 1, slice(2, 4), slice(4, 6), 6, slice(7, 9), 9, 10
 """Where each is among the parameters. BLURS is the lens's part, TOGETHER the correlation."""
 
-NODES = ((0.2113248654, 0.5), (0.7886751346, 0.5))
-"""Places and weights of Gauss and Legendre on 0 to 1."""
-
-ROOT_2, ROOT_2_PI = np.sqrt(2.0), np.sqrt(2.0 * np.pi)
+ROOT_2 = np.sqrt(2.0)
 
 
 class Edge(NamedTuple):
@@ -97,7 +94,7 @@ def edge(away: FloatArray, slant: FloatArray, blur: FloatArray) -> Edge:
     apart = _apart(slant)
     distance = cosine * away[..., 0] + sine * away[..., 1]
     near, far = (distance + apart) / blur, (distance - apart) / blur
-    bells = [np.exp(-0.5 * z * z) / (ROOT_2_PI * blur) for z in (near, far)]
+    bells = [np.exp(-0.5 * z * z) / (np.sqrt(2.0 * np.pi) * blur) for z in (near, far)]
     step = 0.5 * (erf(near / ROOT_2) + erf(far / ROOT_2))
     wide = np.hypot(blur, apart)
     along = cosine * away[..., 1] - sine * away[..., 0]
@@ -124,7 +121,7 @@ def _crossed(
     """
     value, by_1, by_2 = np.zeros_like(z1), np.zeros_like(z1), np.zeros_like(z1)
     squares, product = 0.5 * (z1 * z1 + z2 * z2), z1 * z2
-    for node, weight in NODES:
+    for node, weight in ((0.2113248654, 0.5), (0.7886751346, 0.5)):  # Gauss and Legendre's on 0 to 1
         r = together * node
         rest = 1.0 - r * r
         part = (2.0 / np.pi * weight * together / np.sqrt(rest)) * np.exp((r * product - squares) / rest)
@@ -247,7 +244,6 @@ def _alone(
     return alone
 
 
-ROUGH_PX, SETTLED_PX = 0.05, 1e-3
 MOST_TOGETHER = 0.9
 
 
@@ -292,7 +288,7 @@ def fit_saddles(
     wide = np.clip(sharpness_px(image, pixels_px), 0.8, 4.0)
     pixels = pixels_about(image, crossings, pixels_px, jacobians, wide)
     state = _start(pixels, signs, jacobians, wide)
-    _minimised(state, pixels, insets, ROUGH_PX)
+    _minimised(state, pixels, insets, 0.05)
     # what is printed nearby reaches farther where edges are wider than was assumed
     wider = np.flatnonzero(
         (wide_px(state).max(axis=1) > 1.25 * wide) & (np.hypot(*state[:, :2].T) < farthest_px)
@@ -308,7 +304,7 @@ def fit_saddles(
         )
         pixels.u[wider] = chosen.u + shift[:, None]
         pixels.levels[wider], pixels.weights[wider] = chosen.levels, chosen.weights
-    square, normal, settled = _minimised(state, pixels, insets, SETTLED_PX)
+    square, normal, settled = _minimised(state, pixels, insets, 1e-3)
     freedom = pixels.weights.sum(axis=1) - PARAMETERS
     noise = np.sqrt(square / np.maximum(freedom, 1.0))
     covariance = np.linalg.inv(normal + 1e-9 * (diagonals(normal) + np.eye(PARAMETERS)))
