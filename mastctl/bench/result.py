@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from calib.adjust.result import BenchCalibration
-from calib.errors import BadFile
 from calib.files.mast_file import StoredRig, joint_keys
 from calib.geometry.rig import Rig
 from calib.survey.records import Survey
@@ -20,22 +19,12 @@ from mastctl.bench.run import BenchRun, Reporter
 from mastctl.bench.survey import RoverFrame, fit_in_frame
 from mastctl.calibration.drawn import cells_seen
 from mastctl.calibration.landing import expected_pointing
-from mastctl.calibration.mast_file import fit_document, picked, save_new, with_fit
-from mastctl.calibration.reasons import CalibrationVerdict
-from mastctl.calibration.report import write_report
-from mastctl.calibration.run import checked_survey
-from mastctl.calibration.verdict import judge
-from mastctl.errors import MastctlError
+from mastctl.calibration.mast_file import fit_document, picked, with_fit
+from mastctl.calibration.run import checked_survey, conclude
+from mastctl.calibration.verdict import CalibrationVerdict, judge
 from mastctl.report.tables import Table
 
 HALF = 0.5
-PAGE = "bench.html"
-
-
-class NotReported(MastctlError):
-    """The mast file is saved, its report is not."""
-
-    code = "report_not_written"
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +41,9 @@ class BenchDone:
     calibration: BenchCalibration
     verdict: CalibrationVerdict
     saved: StoredRig
-    checked: Checked | None = None
+    checked: Checked | None
+    worth: Sequence[tuple[str, str]]
+    """What a pointing may expect, and what was measured: quantities and values."""
     _: KW_ONLY
     predicted_px: float | None = None
     calibrated_px: float | None = None
@@ -102,7 +93,7 @@ class BenchDone:
             yield line
         for term in fit.terms:
             yield term.sentence
-        yield from (f"{quantity}: {value}" for quantity, value in _worth(self))
+        yield from (f"{quantity}: {value}" for quantity, value in self.worth)
         yield from (f"fixed: {sentence}" for sentence in fit.gauges)
         yield from (f"note: {sentence}" for sentence in fit.notes)
         yield from (f"left out: {outlier.sentence}" for outlier in fit.outliers[:10])
@@ -116,9 +107,9 @@ class BenchDone:
         """Return the verdict, with the cameras of whose image less than `HALF` was seen."""
         few = [f"{name} {100 * part:.0f} %" for name, part in self.coverage.items() if part < HALF]
         if not few:
-            return f"verdict: {self.verdict.words}"
+            return f"verdict: {self.verdict.advice}"
         return (
-            f"verdict: {self.verdict.words}, but corners were seen over less than half of the image of "
+            f"verdict: {self.verdict.advice}, but corners were seen over less than half of the image of "
             f"{', '.join(few)}; where none were, the lens is extrapolated"
         )
 
@@ -184,19 +175,18 @@ def _save(
     if former is not None:
         fit = replace(fit, notes=(*fit.notes, *_former_notes(fit, former)))
     rig = with_fit(fit, survey, verdict)
-    saved, _ = save_new(rig if former is None else with_former(rig, former), out)
+    rig = rig if former is None else with_former(rig, former)
     expected = expected_pointing(fit)
     calibrated_px = None if expected is None else expected[0].rms_px(expected[1])
-    done = BenchDone(survey, fit, verdict, saved, checked, calibrated_px=calibrated_px, **numbers)
-    if report is None:
-        return done
-    own = {"worth": Table(("quantity", "value"), list(_worth(done))), "pointings": _pointings(checked)}
-    promised_px = None if checked is None else checked.promised_px
-    try:
-        page = write_report(report, PAGE, survey, fit, verdict, saved, former, promised_px, **own)
-    except (OSError, BadFile) as error:
-        raise NotReported(f"the mast file {saved.path} is saved, but its report is not: {error}") from None
-    return replace(done, page=page)
+    numbers["calibrated_px"] = calibrated_px
+    worth = list(_worth(checked, numbers))
+    own = {
+        "worth": Table(("quantity", "value"), worth),
+        "pointings": _pointings(checked),
+        "promised_px": None if checked is None else checked.promised_px,
+    }
+    saved, _, page = conclude(survey, fit, verdict, rig, out, report, former, **own)
+    return BenchDone(survey, fit, verdict, saved, checked, worth, page=page, **numbers)
 
 
 def with_former(rig: Rig, former: Rig) -> Rig:
@@ -222,24 +212,23 @@ def _former_notes(fit: BenchCalibration, former: Rig) -> Iterator[str]:
             )
 
 
-def _worth(done: BenchDone) -> Iterator[tuple[str, str]]:
-    """What a pointing may expect, and what was measured: quantities and values."""
-    if done.calibrated_px is not None:
-        yield "first pointing, rms an axis, by the calibration", px(done.calibrated_px)
-    if done.counts_px is not None:
-        yield "the same by the encoders' counts alone", px(done.counts_px)
-    if done.checked is not None and done.checked.pointing_rms_px is not None:
-        x, y = done.checked.pointing_rms_px
-        promised = done.checked.pointing_promised_px or 0.0
+def _worth(checked: Checked | None, numbers: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+    if numbers["calibrated_px"] is not None:
+        yield "first pointing, rms an axis, by the calibration", px(numbers["calibrated_px"])
+    if numbers["counts_px"] is not None:
+        yield "the same by the encoders' counts alone", px(numbers["counts_px"])
+    if checked is not None and checked.pointing_rms_px is not None:
+        x, y = checked.pointing_rms_px
+        promised = checked.pointing_promised_px or 0.0
         yield (
-            f"pointed at {len(done.checked.pointings)} corners, rms x and y",
+            f"pointed at {len(checked.pointings)} corners, rms x and y",
             f"{x:.2f}, {y:.2f} px, promised {promised:.2f}",
         )
-    if done.seconds is not None:
+    if "seconds" in numbers:
         yield (
             "taken",
-            f"{done.placements} placements, {done.pictures} pictures a camera, "
-            f"{done.seconds:.0f} s of the rover's time",
+            f"{numbers['placements']} placements, {numbers['pictures']} pictures a camera, "
+            f"{numbers['seconds']:.0f} s of the rover's time",
         )
 
 

@@ -31,7 +31,7 @@ from calib.survey.records import Approach, Sigma, Survey, SurveyCamera, SurveyIm
 from calib.survey.writer import BenchFolder, NotWritten
 from calib.targets.boards import AnyBoard
 from mastctl.bench.mast import BenchLook, SeenBoard
-from mastctl.calibration.differences import implied_motion
+from mastctl.calibration.landing import implied_motion
 from mastctl.errors import MastctlError
 from mastctl.json_lines import append_line
 

@@ -15,7 +15,6 @@ from calib.geometry.rigid import FloatArray, Rigid
 from calib.plan.knowledge import ExpectedPointing
 from calib.survey.records import Survey
 from calib.targets.boards import Board
-from mastctl.calibration.differences import Difference
 from mastctl.report import plots
 
 CELLS = (16, 12)
@@ -184,21 +183,6 @@ def workspace(aim: ExpectedPointing, covariance: FloatArray, fit: FittedRig) -> 
         axis.set_ylim(np.degrees(tilts[0]), np.degrees(tilts[-1]))
     axes[0].set_ylabel("tilt, deg")
     figure.colorbar(shown, ax=axes, label="first pointing, rms an axis, px")
-    return figure
-
-
-def differences(found: Sequence[Difference], rig: Rig) -> Any:
-    """Draw how far each camera's lens is from the former mast file's, the implied motion taken out."""
-    figure, axes = _image_of_each(rig, [one.camera for one in found])
-    for axis, one in zip(axes, found, strict=True):
-        seen = ~np.isnan(one.lens_px).any(axis=1)
-        scale = _arrow_scale(one.lens_px[seen], one.size_px[0])
-        axis.quiver(
-            *one.pixels_px[seen].T, *one.lens_px[seen].T, color=plots.VIOLET, angles="xy", scale_units="xy",
-            scale=scale, width=0.003,
-        )  # fmt: skip
-        axis.set_title(f"{one.camera}: {one.rms_px:.2f} px rms", fontsize=10)
-        axis.set_xlabel(f"x, px; arrows drawn {1 / scale:.0f} times as long")
     return figure
 
 

@@ -1,4 +1,4 @@
-"""Where a target lands that a rig points at: by another rig that is the true one, or by its uncertainty.
+"""Where a target lands that a rig points at, by another rig or its uncertainty; how far two rigs differ.
 
 A pointing as the daemon does it: two pixels of a stereo pair, triangulated and pointed at by the believed
 rig. Where the target lands then is by the true one. The paper's sections IV and V, without a renderer.
@@ -6,29 +6,36 @@ rig. Where the target lands then is by the true one. The paper's sections IV and
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
-from calib.adjust.result import Calibration, FittedRig
-from calib.adjust.uncertainty import pointing_covariance
+from calib.adjust.result import FittedRig
 from calib.errors import CalibError
+from calib.geometry.cahvor import CameraModel
 from calib.geometry.covariance import RigCovariance
+from calib.geometry.parameters import predict
 from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig
-from calib.geometry.rigid import FloatArray
+from calib.geometry.rigid import FloatArray, Rigid, moved_rigid
 from calib.geometry.stereo import triangulate
 from calib.plan.knowledge import ExpectedPointing, Knowledge, Workspace, pointing
 from mastctl.errors import MastctlError
 
 POINTING_RANGE_M = 6.0
 
-NEAR_CORNERS = ((0.2, 0.2), (0.8, 0.2), (0.2, 0.8), (0.8, 0.8))
+NEAR_CORNER = (0.2, 0.2)
 """Where targets are clicked, as part of the image's width and height: off the middle."""
 
 PANS_RAD, TILTS_RAD = (-2.0, -1.0, 0.0, 1.0, 2.0), (-0.9, -0.4, 0.1, 0.6)
 """Joint angles at which two rigs are compared."""
+
+GRID = (13, 10)
+RANGES_M = (2.0, 20.0)
+"""Pixels of an image and ranges at which two cameras are compared."""
 
 
 def click(
@@ -36,12 +43,8 @@ def click(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return a target (3,), rover frame, metres, and its true pixels (2,) in the left and right image.
 
-    The target is ``range_m`` along the true ray of ``left_px`` at the given joint angles.
-
-    Raises
-    ------
-    CalibError
-        If one of the two cameras does not see it.
+    The target is ``range_m`` along the true ray of ``left_px`` at the given joint angles. Raises CalibError
+    if one of the two cameras does not see it.
     """
     rays = true.camera_in_rover(pair[0], pan_rad, tilt_rad).ray(left_px)
     target = rays.origins_m + range_m * rays.directions
@@ -52,10 +55,7 @@ def click(
 def seen(rig: Rig, camera: str, pan_rad: float, tilt_rad: float, point_m: FloatArray) -> FloatArray:
     """Return the pixel (2,) of a rover-frame point (3,), metres, inside or outside the image.
 
-    Raises
-    ------
-    CalibError
-        If the camera cannot project it.
+    Raises CalibError if the camera cannot project it.
     """
     pixel, valid = rig.camera_in_rover(camera, pan_rad, tilt_rad).project(point_m)
     if not valid:
@@ -75,12 +75,8 @@ def pointing_error_px(
 ) -> FloatArray:
     """Return how far (2,), pixels, a target lands from the middle of the left image after one pointing.
 
-    The target (3,), rover frame, was clicked in both images (2,) at the given joint angles.
-
-    Raises
-    ------
-    CalibError
-        If the believed rig finds no such point, or cannot point at it.
+    The target (3,), rover frame, was clicked in both images (2,) at the given joint angles. Raises CalibError
+    if the believed rig finds no such point, or cannot point at it.
     """
     left, right = (believed.camera_in_rover(name, pan_rad, tilt_rad) for name in pair)
     found = triangulate(left, right, left_px, right_px)
@@ -133,57 +129,38 @@ def handoff_errors_px(
     return errors
 
 
-def first_cameras(rig: Rig) -> tuple[str, ...]:
-    """Return the cameras that point: the Navcam pair, else a pair on the head, else one camera.
-
-    Raises
-    ------
-    MastctlError
-        If no camera is on the head.
-    """
+def head_cameras(rig: Rig) -> Sequence[tuple[str, ...]]:
+    """Return the cameras that point: the pairs on the head, the Navcams first, else one camera, else none."""
     pairs = {n: p for n, p in rig.stereo.items() if all(rig.cameras[c].on == "head" for c in p)}
     if pairs:
-        return pairs.get("navcam") or next(iter(pairs.values()))
-    single = [name for name, camera in rig.cameras.items() if camera.on == "head"]
-    if not single:
-        raise MastctlError("the mast file has no camera on the head, and so no head to calibrate")
-    return (single[0],)
+        return [pairs[name] for name in sorted(pairs, key=lambda name: name != "navcam")]
+    return [(name,) for name, camera in rig.cameras.items() if camera.on == "head"][:1]
 
 
-def expected_pointing(fit: FittedRig) -> tuple[ExpectedPointing, FloatArray] | None:
+def first_cameras(rig: Rig) -> tuple[str, ...]:
+    """Return the first of `head_cameras`. Raises MastctlError if no camera is on the head."""
+    for cameras in head_cameras(rig):
+        return cameras
+    raise MastctlError("the mast file has no camera on the head, and so no head to calibrate")
+
+
+def expected_pointing(
+    fit: FittedRig, cameras: tuple[str, ...] | None = None
+) -> tuple[ExpectedPointing, FloatArray] | None:
     """Return how first pointings depend on a fitted rig's numbers, and their covariance.
 
-    Over the angles at which boards were seen, targets at 2, 6 and 10 m, clicked in the first pair of the head
-    (or its first camera, the range given). None if nothing can be pointed at.
+    Over the angles at which boards were seen, targets at 2, 6 and 10 m, clicked in these cameras, by default
+    the first (one camera gets the range). None if nothing can be pointed at.
     """
     readings = np.array([(i.pan_rad, i.tilt_rad) for i in fit.images if i.pan_rad is not None], dtype=float)
     low, high = readings.min(axis=0).tolist(), readings.max(axis=0).tolist()
     known = Knowledge(fit.rig, {})
-    where = Workspace(first_cameras(fit.rig), (low[0], high[0]), (low[1], high[1]))
+    where = Workspace(cameras or first_cameras(fit.rig), (low[0], high[0]), (low[1], high[1]))
     try:
         landings = pointing(known, where)
     except CalibError:
         return None
     return landings, RigCovariance(fit.parameter_names, fit.covariance).among(known.names)
-
-
-def pointing_sigma_px(fit: Calibration, pair: tuple[str, str]) -> float | None:
-    """Return the sigma (rms per axis, pixels) of pointing at targets clicked near the image's corners.
-
-    None if no such target can be pointed at.
-    """
-    size_px = np.array(fit.rig.cameras[pair[0]].model.size_px)
-    seen = [i for i in fit.images if i.camera == pair[0] and i.pan_rad is not None]
-    pan = float(np.median([i.pan_rad for i in seen])) if seen else 0.0
-    tilt = float(np.median([i.tilt_rad for i in seen])) if seen else 0.0
-    variances = []
-    for corner in NEAR_CORNERS:
-        try:
-            covariance = pointing_covariance(fit, pair, pan, tilt, size_px * corner, POINTING_RANGE_M)
-        except CalibError:
-            continue
-        variances.append(np.trace(covariance) / 2)
-    return float(np.sqrt(np.mean(variances))) if variances else None
 
 
 def pointing_change(new: Rig, old: Rig) -> dict[str, dict[str, float]]:
@@ -195,9 +172,10 @@ def pointing_change(new: Rig, old: Rig) -> dict[str, dict[str, float]]:
     """
     found = {}
     for pair, names in new.stereo.items():
-        if any(rig.cameras[n].on != "head" for rig in (new, old) for n in names if n in rig.cameras):
-            continue
-        if any(name not in old.cameras for name in names):
+        if any(
+            name not in old.cameras or "rover" in (new.cameras[name].on, old.cameras[name].on)
+            for name in names
+        ):
             continue
         size_px = np.array(new.cameras[names[0]].model.size_px)
         clicked, placed = [], []
@@ -205,7 +183,7 @@ def pointing_change(new: Rig, old: Rig) -> dict[str, dict[str, float]]:
             for pan in PANS_RAD:
                 try:
                     target, left, right = click(
-                        new, names, pan, tilt, size_px * NEAR_CORNERS[0], POINTING_RANGE_M
+                        new, names, pan, tilt, size_px * NEAR_CORNER, POINTING_RANGE_M
                     )
                     off_px = pointing_error_px(old, new, names, pan, tilt, target, left, right)
                     clicked.append(np.linalg.norm(off_px))
@@ -221,3 +199,65 @@ def pointing_change(new: Rig, old: Rig) -> dict[str, dict[str, float]]:
                 "position_most_px": float(np.max(placed)),
             }
     return found
+
+
+def rig_differences(new: Rig, former: Rig) -> Iterator[str]:
+    """Yield how each camera that both rigs have, of the same size and mount, differs: by a motion and a lens.
+
+    The motion makes the former camera project as the new one does, as well as one can. The lens differs by
+    new less former pixel of what the former saw far away, the motion taken out.
+    """
+    for name, camera in new.cameras.items():
+        old = former.cameras.get(name)
+        if old is None or old.on != camera.on or old.model.size_px != camera.model.size_px:
+            continue
+        moved, _ = implied_motion([(camera.model, old.model)])
+        pixels, far = _seen_grid(old.model, RANGES_M[-1:])
+        now, valid = camera.model.project(moved.points(far))
+        rms_px = (
+            float(np.sqrt(np.mean(np.sum((now - pixels)[valid] ** 2, axis=1)))) if valid.any() else np.nan
+        )
+        # Points moved into the camera's place: the camera moved the other way.
+        turn = -1e3 * Rotation.from_matrix(moved.rotation).as_rotvec()
+        shift = 1e3 * moved.inverse.translation_m
+        unseen = 100 * float(1.0 - valid.mean())
+        yield (
+            f"{name}: turned by {turn[0]:+.2f}, {turn[1]:+.2f}, {turn[2]:+.2f} mrad about x, y, z "
+            f"and shifted by {shift[0]:+.1f}, {shift[1]:+.1f}, {shift[2]:+.1f} mm; "
+            f"its lens differs by {rms_px:.2f} px rms"
+            + (f"; {unseen:.0f} % of what it saw has no pixel any more" if unseen else "")
+        )
+
+
+def implied_motion(pairs: Sequence[tuple[CameraModel, CameraModel]]) -> tuple[Rigid, float]:
+    """Return the motion of points after which new cameras see them as the former ones saw them before.
+
+    By least squares over all images, with the rms per axis that is left, px. ``pairs`` are new and former
+    models; all of the new ones in one frame, all of the former in another.
+    """
+    new, former = pairs[0]
+    turn = new.rotation.T @ former.rotation
+    start = Rigid(turn, new.C - turn @ former.C)
+    seen = [(one, *_seen_grid(old, RANGES_M)) for one, old in pairs]
+
+    def off_px(step: FloatArray) -> FloatArray:
+        moved = moved_rigid(start, step)
+        off = [predict(one, moved.points(points)).pixels_px - pixels for one, pixels, points in seen]
+        return np.nan_to_num(np.concatenate(off).ravel(), posinf=0.0, neginf=0.0)
+
+    found = least_squares(off_px, np.zeros(6), xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    both = found.fun != 0.0  # where both see
+    return moved_rigid(start, found.x), float(np.sqrt(np.mean(found.fun[both] ** 2))) if both.any() else 0.0
+
+
+def _seen_grid(camera: CameraModel, ranges_m: Sequence[float]) -> tuple[FloatArray, FloatArray]:
+    """Pixels (n, 2) over a camera's picture, and points (n, 3) seen there, range after range."""
+    width, height = camera.size_px
+    x, y = np.meshgrid(
+        (np.arange(GRID[0]) + 0.5) * width / GRID[0] - 0.5,
+        (np.arange(GRID[1]) + 0.5) * height / GRID[1] - 0.5,
+    )
+    pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
+    rays = camera.ray(pixels)
+    points = [rays.origins_m + range_m * rays.directions for range_m in ranges_m]
+    return np.concatenate([pixels] * len(ranges_m)), np.concatenate(points)

@@ -22,8 +22,8 @@ from calib.geometry.covariance import RigCovariance
 from calib.geometry.rig import Rig
 from calib.survey.records import Survey
 from mastctl.as_json import as_json
-from mastctl.calibration.reasons import CalibrationVerdict
 from mastctl.calibration.sigmas import sigmas_as_json
+from mastctl.calibration.verdict import CalibrationVerdict
 
 DIGITS = 9
 """Significant digits of the covariance: enough that it stays positive definite."""
@@ -82,7 +82,7 @@ def with_fit(fit: Calibration | BenchCalibration, survey: Survey, verdict: Calib
     """
     if isinstance(fit, Calibration):
         method = picked(fit, "method", "mast_parameters")
-        own: dict[str, Any] = {"asked_for": [model.sentence for model in fit.wider if model.significant]}
+        own: dict[str, Any] = {"needed": [model.sentence for model in fit.wider if model.significant]}
     else:
         method = {"method": "bench"}
         own = {

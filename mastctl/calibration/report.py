@@ -15,10 +15,9 @@ from calib.geometry.rig import Rig
 from calib.survey.records import Survey
 from mastctl.as_json import readable
 from mastctl.calibration import drawn
-from mastctl.calibration.differences import rig_differences
-from mastctl.calibration.landing import expected_pointing, pointing_change
-from mastctl.calibration.reasons import CalibrationVerdict
+from mastctl.calibration.landing import expected_pointing, pointing_change, rig_differences
 from mastctl.calibration.sigmas import finding_table, sigma_table
+from mastctl.calibration.verdict import CalibrationVerdict
 from mastctl.report import pages, plots
 from mastctl.report.pictures import Figure
 from mastctl.report.tables import Table, number, x_y
@@ -30,7 +29,6 @@ WORST_IMAGES = 12
 
 def write_report(
     folder: Path,
-    file: str,
     survey: Survey,
     fit: AnyFit,
     verdict: CalibrationVerdict,
@@ -41,34 +39,24 @@ def write_report(
 ) -> Path:
     """Write the page into ``folder`` (made if need be) in one step and return it.
 
-    A page that was there is kept as ``NAME.previous.html``.
-
-    Parameters
-    ----------
-    former
-        The rig to compare with.
-    promised_px
-        What the fit promised of images that were not fitted, rms per axis by camera.
-    own
-        ``worth``, ``pointings``: tables of a bench; ``warnings``, ``undetected``: sentences of a survey.
-
-    Raises
-    ------
-    OSError, BadFile
-        If it cannot be written; then the file is as it was.
+    A page that was there is kept as ``NAME.previous.html``. ``former`` is the rig to compare with,
+    ``promised_px`` what the fit promised of images that were not fitted, rms per axis by camera. ``own``:
+    ``worth``, ``pointings``, tables of a bench; ``warnings``, ``undetected``, sentences of a survey. Raises
+    OSError, BadFile if it cannot be written; then the file is as it was.
     """
     if isinstance(fit, BenchCalibration):
-        title, method = "Bench calibration", "bench"
+        title, method, file = "Bench calibration", "bench", "bench.html"
         parts: dict[str, Any] = {"terms": _terms(fit), "wider": None, "station": None}
     else:
-        title, method = "Mast calibration", f"{fit.method}, {fit.mast_parameters} mast parameters"
+        title, file = "Mast calibration", "calibration.html"
+        method = f"{fit.method}, {fit.mast_parameters} mast parameters"
         wider, station = finding_table("wider model", fit.wider), _station_table(fit)
         parts = {"terms": None, "wider": wider, "station": station}
     date = str(saved.rig.provenance.get("date", "")).replace("T", " ").replace("+00:00", " UTC")
     page = pages.page(
         "calibration.html",
         title=title,
-        badge=pages.Badge(verdict.words.upper(), verdict.grade),
+        badge=pages.Badge(verdict.advice.upper(), verdict.grade),
         facts=[
             ("survey", survey.folder.resolve().name),
             ("digest", survey.digest[:12]),
@@ -85,7 +73,7 @@ def write_report(
         notes=fit.notes,
         held_fixed=fit.gauges if isinstance(fit, BenchCalibration) else HELD_FIXED,
         left_out=[outlier.sentence for outlier in fit.outliers],
-        plots=list(_plots(survey, fit, former)) if plots.installed() else None,
+        plots=list(_plots(survey, fit)) if plots.installed() else None,
         changes=[] if former is None else list(_changes(fit.rig, former)),
         worst_images=_worst_images(fit),
         **parts,
@@ -137,13 +125,13 @@ def camera_table(fit: FittedRig, promised_px: Mapping[str, float] | None = None)
     return Table((*headings, *([] if promised_px is None else ["promised px"])), rows)
 
 
-def _plots(survey: Survey, fit: AnyFit, former: Rig | None) -> Iterable[tuple[str, Figure]]:
+def _plots(survey: Survey, fit: AnyFit) -> Iterable[tuple[str, Figure]]:
     """Every plot, with its heading."""
-    for heading, figure, alt, caption in _drawn(survey, fit, former):
+    for heading, figure, alt, caption in _drawn(survey, fit):
         yield heading, plots.plot(figure, alt, caption, "map" if alt.startswith("maps") else "lines")
 
 
-def _drawn(survey: Survey, fit: AnyFit, former: Rig | None) -> Iterable[tuple[str, Any, str, str]]:
+def _drawn(survey: Survey, fit: AnyFit) -> Iterable[tuple[str, Any, str, str]]:
     """Heading, figure, what it shows for those who cannot see it, caption."""
     cameras = [name for name in fit.rig.cameras if any(i.camera == name for i in fit.images)]
     yield (
@@ -195,19 +183,11 @@ def _drawn(survey: Survey, fit: AnyFit, former: Rig | None) -> Iterable[tuple[st
             "maps of the predicted pointing error over pan and tilt",
             "One sigma an axis of a first pointing, by the calibration; dots are images.",
         )
-    found = [] if former is None else list(rig_differences(fit.rig, former))
-    if found:
-        yield (
-            "How each lens differs from the former mast file's",
-            drawn.differences(found, fit.rig),
-            "arrows between the new and the former model of each lens",
-            "Where the new model sees what the former one saw at a pixel, the implied motion taken out.",
-        )
 
 
 def _changes(rig: Rig, former: Rig) -> Iterable[str]:
     """By how much cameras and pointing differ from the former mast file."""
-    yield from (one.sentence for one in rig_differences(rig, former))
+    yield from rig_differences(rig, former)
     for pair, change in pointing_change(rig, former).items():
         yield (
             f"pointing {pair} at what was clicked would change by {change['median_px']:.2f} px, at most "

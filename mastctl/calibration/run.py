@@ -1,4 +1,4 @@
-"""The way from a survey folder to a saved mast file; refusals on the way leave every file as it was."""
+"""From a survey folder to a saved mast file; a refusal on the way leaves every file as it was."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from calib.adjust.result import Calibration
+from calib.adjust.result import BenchCalibration, Calibration
 from calib.calibrate.paper import fit_paper
 from calib.calibrate.survey import fit_joint
-from calib.errors import CalibError
+from calib.errors import BadFile, CalibError
 from calib.files.mast_file import StoredRig
+from calib.geometry.rig import Rig
 from calib.survey.check import check_survey
 from calib.survey.find_dots import Progress, detect_survey
 from calib.survey.records import Survey, SurveyFinding
 from mastctl.calibration.mast_file import save_new, with_fit
-from mastctl.calibration.reasons import CalibrationVerdict
-from mastctl.calibration.verdict import judge
+from mastctl.calibration.verdict import CalibrationVerdict, judge
 from mastctl.errors import MastctlError
 
 Method = Literal["paper", "joint"]
@@ -35,14 +35,21 @@ class SurveyRefused(MastctlError):
     def __init__(self, survey: Survey, findings: Sequence[SurveyFinding]) -> None:
         errors = [finding for finding in findings if finding.severity == "error"]
         self.findings = tuple(findings)
-        self.detail = {"findings": [finding_told(finding) for finding in findings]}
+        keys = "severity", "place", "message", "advice"
+        self.detail = {"findings": [{key: getattr(one, key) for key in keys} for one in findings]}
         more = f" There are {len(errors) - 1} more errors." if len(errors) > 1 else ""
         super().__init__(f"{survey.folder}: {sentence_of(errors[0])}{more}")
 
 
+class NotReported(MastctlError):
+    """The mast file is saved, its report is not."""
+
+    code = "report_not_written"
+
+
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """What came of a survey: the fit, the verdict, the file that holds it, and its former version."""
+    """The result of a survey: the fit, the verdict, the file with its former version, and the report."""
 
     survey: Survey
     calibration: Calibration
@@ -51,6 +58,7 @@ class Calibrated:
     undetected: tuple[tuple[str, str], ...]
     saved: StoredRig
     previous: Path | None
+    page: Path | None
 
 
 def without_dots(survey: Survey) -> tuple[str, ...]:
@@ -74,10 +82,7 @@ def with_dots(
 def checked_survey(survey: Survey, method: Method = "joint") -> tuple[SurveyFinding, ...]:
     """Return the warnings of the check; ``method`` decides which images have to show a camera.
 
-    Raises
-    ------
-    SurveyRefused
-        If the check found an error.
+    Raises SurveyRefused if the check found an error.
     """
     findings = check_survey(survey, only_camera_images=method == "paper")
     if any(finding.severity == "error" for finding in findings):
@@ -92,45 +97,57 @@ def calibrate(
     mast_parameters: int = 6,
     warnings: tuple[SurveyFinding, ...] = (),
     undetected: tuple[tuple[str, str], ...] = (),
+    report: Path | None = None,
+    former: Rig | None = None,
 ) -> Calibrated:
     """Fit a checked survey with its dots, judge the result, and save it as a mast file.
 
     Every former version of ``out`` is kept, the last as ``NAME.previous.yaml``. ``warnings`` and
-    ``undetected``, from the check and from the search for dots, are for the verdict.
-
-    Raises
-    ------
-    SurveyNotFitted
-        If the fit finds no good minimum; nothing is written.
-    BadFile
-        If ``out`` cannot be written; it holds what it held before.
+    ``undetected``, from the check and from the search for dots, are for the verdict; ``report`` is a folder,
+    ``former`` the rig to compare with there. Raises SurveyNotFitted if the fit finds no good minimum: nothing
+    is written; else as `conclude`.
     """
     calibration = FITS[method](survey, mast_parameters)
-    jointly = None if method == "joint" else _jointly(survey, mast_parameters)
+    jointly: Calibration | CalibError | None = None
+    if method != "joint":
+        try:
+            jointly = fit_joint(survey, mast_parameters)
+        except CalibError as error:
+            jointly = error
     verdict = judge(survey, calibration, warnings, [name for name, _ in undetected], jointly)
-    saved, previous = save_new(with_fit(calibration, survey, verdict), out)
     sentences = tuple(sentence_of(finding) for finding in warnings)
-    return Calibrated(survey, calibration, verdict, sentences, undetected, saved, previous)
+    rig = with_fit(calibration, survey, verdict)
+    own = {"warnings": sentences, "undetected": [f"{name}: {reason}" for name, reason in undetected]}
+    saved = conclude(survey, calibration, verdict, rig, out, report, former, **own)
+    return Calibrated(survey, calibration, verdict, sentences, undetected, *saved)
 
 
-def _jointly(survey: Survey, mast_parameters: int) -> Calibration | CalibError:
-    """The joint fit, whose tests judge a survey whichever method calibrates by it; or why there is none."""
+def conclude(
+    survey: Survey,
+    fit: Calibration | BenchCalibration,
+    verdict: CalibrationVerdict,
+    rig: Rig,
+    out: Path,
+    report: Path | None,
+    former: Rig | None,
+    **own: Any,
+) -> tuple[StoredRig, Path | None, Path | None]:
+    """Save a judged fit's rig as a mast file, and write its report if a folder is given for it.
+
+    Returns the file, the name of its former version, and the page; ``own`` as of `write_report`. Raises
+    BadFile if ``out`` cannot be written: it holds what it held before; NotReported.
+    """
+    saved, previous = save_new(rig, out)
+    if report is None:
+        return saved, previous, None
+    from mastctl.calibration.report import write_report
+
     try:
-        return fit_joint(survey, mast_parameters)
-    except CalibError as error:
-        return error
+        return saved, previous, write_report(report, survey, fit, verdict, saved, former, **own)
+    except (OSError, BadFile) as error:
+        raise NotReported(f"the mast file {saved.path} is saved, but its report is not: {error}") from None
 
 
 def sentence_of(finding: SurveyFinding) -> str:
     """Return a finding as one sentence: where, what, and what to measure next."""
     return str(finding).removeprefix(f"{finding.severity}: ")
-
-
-def finding_told(finding: SurveyFinding) -> dict[str, Any]:
-    """Return a finding as JSON."""
-    return {
-        "severity": finding.severity,
-        "place": finding.place,
-        "message": finding.message,
-        "advice": finding.advice,
-    }

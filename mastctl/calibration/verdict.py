@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import takewhile
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calib.adjust.goodness import Component, as_one
 from calib.adjust.result import BenchCalibration, Calibration, FittedRig, ImageResiduals
+from calib.adjust.terms import PRISMS, TAPES
 from calib.errors import CalibError
 from calib.geometry.significance import Level
 from calib.survey.records import Survey, SurveyFinding
-from mastctl.calibration.checks import exchanged_boards
-from mastctl.calibration.landing import POINTING_RANGE_M, expected_pointing, pointing_sigma_px
-from mastctl.calibration.reasons import CalibrationVerdict, Grade, Reason
-from mastctl.calibration.sigmas import chi_square_reason, sigma_reasons
+from mastctl.calibration.landing import expected_pointing, head_cameras
+from mastctl.calibration.sigmas import OWN, order_px, stated
+
+Grade = Literal["good", "care", "bad"]
+
+ADVICE: Mapping[Grade, str] = {
+    "good": "trust it",
+    "care": "use it with care",
+    "bad": "do not trust it",
+}
 
 POINTING_GOOD_PX = 0.5
 POINTING_BAD_PX = 2.0
@@ -39,6 +48,52 @@ FEW_IMAGES = 4
 LITTLE = 0.2
 """Corners that are off by less than this part of ``corner_px`` are no reason for doubt."""
 
+UNEXPLAINED, HOPELESS = 2.0, 5.0
+"""Residuals so many times their stated sigmas that no kind of measurement explains are a model's; kinds that
+scatter so many times more or less than stated are not what they are treated as."""
+
+MANY_UNEVEN = 0.25
+"""Share of images noisier than stated above which the cause should be looked for."""
+
+CLOSER = 0.1
+"""Another board is the one that is shown if it fits the image so many times better than its own."""
+
+FAR_PX = 20.0
+"""The same where the image's own board has no pixels to compare with."""
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One test's outcome as a sentence."""
+
+    grade: Grade
+    sentence: str
+
+
+@dataclass(frozen=True)
+class CalibrationVerdict:
+    """The worst of the reasons decides."""
+
+    grade: Grade
+    reasons: tuple[Reason, ...]
+
+    @classmethod
+    def by(cls, reasons: Iterable[Reason]) -> CalibrationVerdict:
+        """Return the verdict of some reasons."""
+        every = tuple(reasons)
+        grades = {reason.grade for reason in every}
+        return cls("bad" if "bad" in grades else "care" if "care" in grades else "good", every)
+
+    @property
+    def advice(self) -> str:
+        """The grade as a person says it."""
+        return ADVICE[self.grade]
+
+    def as_json(self) -> dict[str, object]:
+        """Return it as JSON or YAML."""
+        reasons = [{"grade": reason.grade, "sentence": reason.sentence} for reason in self.reasons]
+        return {"grade": self.grade, "words": self.advice, "reasons": reasons}
+
 
 def judge(
     survey: Survey,
@@ -47,21 +102,11 @@ def judge(
     undetected: Sequence[str] = (),
     jointly: Calibration | CalibError | None = None,
 ) -> CalibrationVerdict:
-    """Return whether to trust a calibration.
+    """Return whether to trust a calibration; ``survey`` with the dots or corners that were fitted.
 
-    Parameters
-    ----------
-    survey
-        With the dots or corners that were fitted.
-    fit
-        The result.
-    warnings
-        The warnings of the survey's check. What the joint fit tests again, finer, is left to its tests.
-    undetected
-        Names of images in which no dots were found.
-    jointly
-        The joint fit of a survey that was calibrated by the paper's method, which has no tests of its own; or
-        why there is none.
+    Of ``warnings`` of the survey's check, what the joint fit tests again, finer, is left to its tests.
+    ``undetected`` are images in which no dots were found. ``jointly``: the joint fit of a survey that was
+    calibrated by the paper's method, which has no tests of its own; or why there is none.
     """
     own = (
         _of_survey(survey, fit, warnings, undetected, jointly)
@@ -74,6 +119,7 @@ def judge(
             *_contradictions(fit),
             *_checks(fit),
             *(Reason("bad", direction.sentence) for direction in fit.degenerate),
+            *_pointing(survey, fit),
             *own,
             *_left_out(fit),
         ]
@@ -90,11 +136,9 @@ def _of_survey(
     """The reasons that only a survey has."""
     yield from _wider(fit)
     yield from _jointly(survey, jointly)
-    yield from _odd_images(fit)
     yield from _turned(fit)
-    yield from _pointing_of_pairs(fit)
     yield from _at_the_end(fit)
-    yield from (Reason("care", sentence) for sentence in exchanged_boards(survey, fit))
+    yield from (Reason("care", sentence) for sentence in _exchanged_boards(survey, fit))
     if undetected:
         yield Reason("care", f"no dots were found in {len(undetected)} images: {_some(undetected)}")
     joint = np.isfinite(fit.chi2_probability)
@@ -115,13 +159,12 @@ def _of_bench(survey: Survey, fit: BenchCalibration) -> Iterator[Reason]:
     for drift in fit.drifts:
         if drift.chance < Level.STATED:
             yield Reason("bad" if drift.size_px > POINTING_GOOD_PX else "care", drift.sentence)
-    yield _pointing_of_workspace(fit)
 
 
 def _noise(survey: Survey, fit: Calibration | BenchCalibration) -> list[Reason]:
     """Whether the residuals are what the stated sigmas make them."""
     if isinstance(fit, BenchCalibration) or np.isfinite(fit.chi2_probability):
-        return [chi_square_reason(fit), *sigma_reasons(survey, fit), *_no_more_than_stated(fit)]
+        return [_chi_square(fit), *_sigmas(survey, fit), *_no_more_than_stated(fit)]
     worst_px, camera = max((max(xy), name) for name, xy in fit.rms_px.items())
     sentence = f"the largest residual of the fitted images is {worst_px:.2f} px rms ({camera})"
     if worst_px > PAPER_GOOD_PX:
@@ -141,6 +184,85 @@ def _no_more_than_stated(fit: FittedRig) -> list[Reason]:
         f"{most.factor:.2f} ± {most.factor_sigma:.2f} times their sigma"
     )
     return [Reason("good", sentence)]
+
+
+def _chi_square(fit: FittedRig) -> Reason:
+    """Whether the residuals as a whole are what the stated sigmas make them.
+
+    Single kinds of measurements, or images, that explain them have reasons of their own.
+    """
+    freedom = max(fit.degrees_of_freedom, 1.0)
+    factor = float(np.sqrt(fit.chi2 / freedom))
+    explained = any(c.wrong for c in fit.components) or any(i.scatter > 1.0 for i in fit.images)
+    grade: Grade = "good"
+    if fit.chi2_probability < Level.STATED and not explained:
+        grade = "bad" if factor > UNEXPLAINED else "care"
+    return Reason(
+        grade,
+        f"chi-square is {fit.chi2:.0f} for {freedom:.0f} degrees of freedom: the residuals are "
+        f"{factor:.2f} times what the stated sigmas make them",
+    )
+
+
+def _sigmas(survey: Survey, fit: FittedRig) -> list[Reason]:
+    """A reason for each kind of measurement whose stated sigma is not what its residuals show.
+
+    Too small a sigma is a fault of the survey. Too large a one is none, once the fit takes what was found;
+    unless it is so far off that the measurements may be smoothed, or copies.
+    """
+    wrong = [c for c in fit.components if c.wrong]
+    reasons = []
+    for c in (*wrong, *(c for c in fit.components if c.generous)):
+        sigma, unit, key = stated(survey, fit.images, c.kind)
+        # Dots and corners come with what noise leaves of them; prints and lenses are in survey.yaml's sigma.
+        most = max(1.0, order_px(survey) / sigma) if key == OWN else 1.0
+        grade: Grade = "good" if c.generous or 1.0 < c.factor <= most else "care"
+        if c.factor > HOPELESS * most:
+            grade = "bad"
+        elif c.factor < 1.0 / HOPELESS and not survey.boards:  # a bench's are counts, which have no choice
+            grade = "care"
+        sentence = (
+            f"{c.kind} scatter by {c.factor:.2f} ± {c.factor_sigma:.2f} times their stated sigma: "
+            f"{c.factor * sigma:.2g} {unit} where {key} {'say' if key == OWN else 'says'} {sigma:.3g} "
+            f"{unit}; the fit and its uncertainties take {c.weighed * sigma:.2g} {unit}"
+        )
+        if c.wrong and c.kind == PRISMS and all(other.kind != TAPES for other in wrong):
+            sentence += "; tapes do not, so it may be the drawing of the prisms that is off (prism_cad_m)"
+        reasons.append(Reason(grade, sentence))
+    return [*reasons, *_uneven(survey, fit.images), *_one_station(survey, fit.components)]
+
+
+def _uneven(survey: Survey, images: Sequence[ImageResiduals]) -> list[Reason]:
+    """Images that are noisier than others of their camera: each counts with what it scatters."""
+    noisy = [image for image in images if image.scatter > 1.0]
+    if not noisy:
+        return []
+    worst = max(noisy, key=lambda image: image.scatter)
+    beyond = [i for i in noisy if i.scatter * float(np.median(i.sigma_px)) > order_px(survey)]
+    sentence = (
+        f"{len(noisy)} of {len(images)} images scatter more than others of their camera, {worst.name} most, "
+        f"by {worst.scatter:.1f} times; each counts with its own sigma"
+    )
+    if len(beyond) <= MANY_UNEVEN * len(images):
+        return [Reason("good", sentence)]
+    return [Reason("care", f"{sentence}. That is many: look for motion, focus or light")]
+
+
+def _one_station(survey: Survey, components: Sequence[Component]) -> list[Reason]:
+    """Whether prisms scatter as the tapes of the same station do: by tapes alone its sigma is found smaller
+    than stated, and a wrong prism hides under the stated one."""
+    by_kind = {c.kind: c for c in components if np.isfinite(c.factor)}
+    tapes, prisms = by_kind.get(TAPES), by_kind.get(PRISMS)
+    if tapes is None or prisms is None or not tapes.generous or prisms.factor < tapes.factor:
+        return []
+    if as_one(tapes, prisms):
+        return []
+    sigma_mm = 1e3 * survey.sigma.station_m
+    sentence = (
+        f"prisms scatter by {prisms.factor * sigma_mm:.1f} mm where the tapes of the same station do by "
+        f"{tapes.factor * sigma_mm:.1f} mm: one of them, or their drawing, is wrong; measure them again"
+    )
+    return [Reason("care", sentence)]
 
 
 def _wider(fit: Calibration) -> list[Reason]:
@@ -188,28 +310,8 @@ def _jointly(survey: Survey, fit: Calibration | CalibError | None) -> list[Reaso
     if isinstance(fit, CalibError):
         untested = "whether sigmas and model are right was not tested"
         return [Reason("care", f"{untested}, since the survey cannot be fitted jointly: {fit}")]
-    reasons = [*sigma_reasons(survey, fit), *_wider(fit), *_contradictions(fit)]
+    reasons = [*_sigmas(survey, fit), *_wider(fit), *_contradictions(fit)]
     return [replace(reason, sentence=f"fitted jointly, {reason.sentence}") for reason in reasons]
-
-
-def _odd_images(fit: Calibration) -> list[Reason]:
-    """Images that the paper's method kept, though they are far from the others (joint tests each of them)."""
-    if np.isfinite(fit.chi2_probability) or fit.mast_parameters == 4:
-        return []
-    groups: dict[tuple[str, str], list[tuple[float, str]]] = {}
-    for image in fit.images:
-        if image.purpose != "check" and image.used.any():
-            rms_px = float(np.sqrt(np.mean(image.residuals_px[image.used] ** 2)))
-            groups.setdefault((image.camera, image.purpose), []).append((rms_px, image.name))
-    reasons = []
-    for group in groups.values():
-        usual = float(np.median([rms_px for rms_px, _ in group]))
-        odd = [(rms_px, name) for rms_px, name in group if rms_px > ODD_IMAGE * usual]
-        if len(group) >= FEW_IMAGES and odd:
-            rms_px, name = max(odd)
-            off = f"image {name} is off by {rms_px:.2f} px rms where others like it are by {usual:.2f}"
-            reasons.append(Reason("care", f"{off}: check its tapes, its angles and its dots"))
-    return reasons
 
 
 def _checks(fit: Calibration | BenchCalibration) -> list[Reason]:
@@ -264,39 +366,68 @@ def _inexact(survey: Survey, fit: BenchCalibration) -> Iterator[Reason]:
         )
 
 
-def _pointing_of_pairs(fit: Calibration) -> list[Reason]:
-    """How much the calibration alone adds to a pointing from a click, pair by pair."""
-    reasons = []
-    for pair, names in fit.rig.stereo.items():
-        if fit.rig.cameras[names[0]].on != "head":
+def _pointing(survey: Survey, fit: Calibration | BenchCalibration) -> Iterator[Reason]:
+    """How much the calibration adds to a pointing from a click, camera pair by pair."""
+    joint_rad = fit.joint_rad if isinstance(fit, BenchCalibration) else survey.sigma.joint_rad
+    for cameras in head_cameras(fit.rig):
+        by = cameras[0].rpartition("_")[0] if len(cameras) > 1 else cameras[0]
+        expected = expected_pointing(fit, cameras)
+        if expected is None:
+            reason = f"pointing {by} at 2 to 10 m is not possible at the angles at which boards were seen"
+            yield Reason("care", reason)
             continue
-        sigma = pointing_sigma_px(fit, names)
-        if sigma is None:
-            reasons.append(Reason("care", f"pointing by {pair} at {POINTING_RANGE_M:g} m is not possible"))
+        landings, covariance = expected
+        by_rig, by_counts = landings.rms_px(covariance), landings.by_counts_px(joint_rad)
+        sentence = f"a first pointing by {by} is uncertain by {by_rig:.2f} px an axis from calibration"
+        if by_counts > 0.0:
+            sentence += f", by {by_counts:.2f} from what a reading says"
+        good, bad = (max(limit_px, by_counts) for limit_px in (POINTING_GOOD_PX, POINTING_BAD_PX))
+        yield Reason("good" if by_rig <= good else "care" if by_rig <= bad else "bad", sentence)
+
+
+def _exchanged_boards(survey: Survey, calibration: Calibration) -> Iterator[str]:
+    """A sentence for each two placements that were exchanged, and for each image of a wrong placement.
+
+    Of check images and images that the fit left out, every board of their set-up is tried where the fit has
+    it.
+    """
+    left_out = {outlier.name for outlier in calibration.outliers if outlier.kind == "image"}
+    shown: dict[tuple[tuple[str, str], tuple[str, str]], list[str]] = {}
+    for image in calibration.images:
+        if image.purpose == "check" or f"image {image.name}" in left_out:
+            other = _shown_board(survey, calibration, image)
+            if other is not None:
+                shown.setdefault(((image.setup, image.placement), other), []).append(image.name)
+    for (own, other), images in shown.items():
+        back = shown.get((other, own))
+        if back is None:
+            yield (
+                f"{_images(images)} cannot show placement {own[1]} but would show {other[1]} "
+                f"(set-up {own[0]}): correct the placement in images.csv"
+            )
+        elif own < other:
+            yield (
+                f"the boards of placements {own[1]} and {other[1]} (set-up {own[0]}) seem to be exchanged: "
+                f"{_images([*images, *back])} show the other one. Correct the names of the tapes in "
+                "station.csv or the placements in images.csv"
+            )
+
+
+def _shown_board(survey: Survey, calibration: Calibration, image: ImageResiduals) -> tuple[str, str] | None:
+    """The board of the same set-up that the image shows; None if none fits far better than its own."""
+    model = calibration.rig.camera_in_rover(image.camera, image.pan_rad or 0.0, image.tilt_rad or 0.0)
+    in_board = survey.board.dots_in_board_m(image.rows, image.columns)
+    own_px = float(np.sqrt(np.mean(image.residuals_px**2)))
+    best, nearest_px = None, CLOSER * own_px if np.isfinite(own_px) else FAR_PX
+    for placement, pose in calibration.rover_from_board.items():
+        if placement[0] != image.setup or placement[1] == image.placement:
             continue
-        near_corner = f"pointing {pair} at what was clicked near a corner at {POINTING_RANGE_M:g} m"
-        sentence = f"{near_corner} is uncertain by {sigma:.2f} px an axis from calibration alone"
-        reasons.append(Reason(_pointing_grade(sigma), sentence))
-    return reasons
-
-
-def _pointing_of_workspace(fit: BenchCalibration) -> Reason:
-    """How much the calibration adds to a pointing from a click, beside what a reading adds."""
-    expected = expected_pointing(fit)
-    if expected is None:
-        return Reason("care", "pointing at 2 to 10 m is not possible at the angles at which boards were seen")
-    landings, covariance = expected
-    by_rig, by_counts = landings.rms_px(covariance), landings.by_counts_px(fit.joint_rad)
-    sentence = f"a first pointing is uncertain by {by_rig:.2f} px an axis from calibration"
-    if by_counts > 0.0:
-        sentence += f", by {by_counts:.2f} from what a reading says"
-    return Reason(_pointing_grade(by_rig, by_counts), sentence)
-
-
-def _pointing_grade(by_rig_px: float, by_counts_px: float = 0.0) -> Grade:
-    if by_rig_px <= max(POINTING_GOOD_PX, by_counts_px):
-        return "good"
-    return "care" if by_rig_px <= max(POINTING_BAD_PX, by_counts_px) else "bad"
+        predicted, valid = model.project(pose.points(in_board))
+        if valid.all():
+            rms_px = float(np.sqrt(np.mean((predicted - image.pixels_px) ** 2)))
+            if rms_px < nearest_px:
+                best, nearest_px = placement, rms_px
+    return best
 
 
 def _left_out(fit: Calibration | BenchCalibration) -> list[Reason]:
@@ -342,3 +473,7 @@ def _at_the_end(fit: Calibration) -> list[Reason]:
 def _some(names: Sequence[str], most: int = 4) -> str:
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
+
+
+def _images(names: Sequence[str]) -> str:
+    return f"image{'s' * (len(names) > 1)} {_some(names)}"

@@ -159,10 +159,10 @@ def _from_survey(args: argparse.Namespace) -> Answer:
     for warning in warnings:
         output.tell(f"warning: {sentence_of(warning)}")
     with output.waiting(args.json, f"fitting {len(survey.images)} images ({args.method})"):
-        done = calibrate(survey, args.out, args.method, args.mast, warnings, undetected)
-    page = _report(args, done, in_use)
+        former = None if in_use is None else in_use.rig
+        done = calibrate(survey, args.out, args.method, args.mast, warnings, undetected, args.report, former)
     models, lines = families_of(args, survey)
-    return Answer(_document(done, in_use, page) | models, chain(_shown(done, in_use, page), lines))
+    return Answer(_document(done, in_use) | models, chain(_shown(done, in_use), lines))
 
 
 def families_of(args: argparse.Namespace, survey: Survey) -> tuple[dict[str, Any], list[str]]:
@@ -225,26 +225,7 @@ def _with_dots(args: argparse.Namespace, survey: Survey) -> tuple[Survey, tuple[
     return survey, undetected
 
 
-def _report(args: argparse.Namespace, done: Calibrated, in_use: StoredRig | None) -> Path | None:
-    if args.report is None:
-        return None
-    from calib.errors import BadFile
-    from mastctl.calibration.report import write_report
-
-    with output.waiting(args.json, "writing the report"):
-        try:
-            former = None if in_use is None else in_use.rig
-            undetected = [f"{name}: {reason}" for name, reason in done.undetected]
-            return write_report(
-                args.report, "calibration.html", done.survey, done.calibration, done.verdict, done.saved,
-                former, warnings=done.warnings, undetected=undetected,
-            )  # fmt: skip
-        except (OSError, BadFile) as error:
-            saved = f"the mast file {done.saved.path} is saved, but its report is not"
-            raise output.CommandError("report_not_written", f"{saved}: {error}") from None
-
-
-def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> dict[str, Any]:
+def _document(done: Calibrated, in_use: StoredRig | None) -> dict[str, Any]:
     """The document that ``--json`` prints."""
     from calib.adjust.result import HELD_FIXED
     from mastctl.as_json import as_json
@@ -263,7 +244,7 @@ def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> 
         "held_fixed": list(HELD_FIXED),
         "warnings": as_json(done.warnings),
         "undetected": [{"image": name, "reason": reason} for name, reason in done.undetected],
-        "report": None if page is None else str(page),
+        "report": None if done.page is None else str(done.page),
     }
     if in_use is not None:
         document["in_use"] = {
@@ -274,7 +255,7 @@ def _document(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> 
     return document
 
 
-def _shown(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> Iterator[Shown]:
+def _shown(done: Calibrated, in_use: StoredRig | None) -> Iterator[Shown]:
     from mastctl.calibration.landing import pointing_change
     from mastctl.calibration.report import camera_table, mast_table
     from mastctl.calibration.sigmas import finding_table, sigma_table
@@ -307,5 +288,5 @@ def _shown(done: Calibrated, in_use: StoredRig | None, page: Path | None) -> Ite
     reasons = [[reason.grade, reason.sentence] for reason in done.verdict.reasons]
     notes = [f"mast file: {done.saved.path} ({done.saved.digest[:12]})"]
     notes += [f"kept from before: {done.previous}"] if done.previous is not None else []
-    notes += [f"report: {page}"] if page is not None else []
-    yield Shown(f"Verdict: {done.verdict.words}", ["", "reason"], reasons, notes)
+    notes += [f"report: {done.page}"] if done.page is not None else []
+    yield Shown(f"Verdict: {done.verdict.advice}", ["", "reason"], reasons, notes)

@@ -79,7 +79,7 @@ def main() -> int:
     name = options.out.stem
     save_rig(replace(done.saved.rig, name=name, provenance=provenance), options.out)
     stored = load_rig(options.out).rig
-    print(f"wrote {options.out}: {len(done.survey.images)} images, {done.verdict.words}")
+    print(f"wrote {options.out}: {len(done.survey.images)} images, {done.verdict.advice}")
     tell_projection(true_rig.rig, stored)
     tell_pointing(true_rig.rig, stored, options)
     return 0

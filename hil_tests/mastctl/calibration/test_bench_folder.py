@@ -48,7 +48,7 @@ def test_a_folder_gives_a_mast_file_with_joints_covariance_and_a_verdict(
     terms = {term["name"]: term for term in told["terms"]}
     assert terms["pan backlash"]["entered"] and terms["pan backlash"]["chi2"] > 50
     assert told["verdict"]["grade"] in ("good", "care")
-    assert any("first pointing is uncertain" in r["sentence"] for r in told["verdict"]["reasons"])
+    assert any("first pointing by navcam is uncertain" in r["sentence"] for r in told["verdict"]["reasons"])
     assert 0 < told["predicted_px"] < 1.5 and 0.5 < told["counts_px"] < 1.0
     assert "where the vehicle is, pictures cannot show" in told["gauges"][0]
     assert stored.rig.fit["verdict"]["grade"] == told["verdict"]["grade"]

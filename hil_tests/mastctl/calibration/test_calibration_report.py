@@ -14,16 +14,15 @@ from calib.adjust.robust import SurveyNotFitted
 from calib.calibrate.paper import fit_paper
 from calib.calibrate.survey import fit_joint
 from calib.geometry.covariance import moved_rig
+from calib.plan.knowledge import CLICKS
 from calib.survey.records import Click, Survey, SurveyFinding
 from hil_tests.mastctl.calibration.survey_world import navcam_rig, navcam_survey
 from mastctl.calibration.landing import (
-    NEAR_CORNERS,
-    POINTING_RANGE_M,
     click,
+    expected_pointing,
     handoff_errors_px,
     pointing_change,
     pointing_error_px,
-    pointing_sigma_px,
 )
 from mastctl.calibration.verdict import judge
 
@@ -50,17 +49,21 @@ def test_a_rig_that_is_believed_rightly_points_exactly() -> None:
 def test_the_uncertainty_of_pointing_is_the_spread_of_drawn_rigs(fitted: tuple[Survey, Calibration]) -> None:
     _, fit = fitted
     rig, pair = fit.rig, fit.rig.stereo["navcam"]
-    seen = [i for i in fit.images if i.camera == pair[0] and i.pan_rad is not None]
-    pan = float(np.median([i.pan_rad for i in seen]))
-    tilt = float(np.median([i.tilt_rad for i in seen]))
-    size = np.array(rig.cameras[pair[0]].model.size_px)
-    clicks = [click(rig, pair, pan, tilt, size * corner, POINTING_RANGE_M) for corner in NEAR_CORNERS]
+    expected = expected_pointing(fit)
+    assert expected is not None
+    landings, covariance = expected
     rng = np.random.default_rng(5)
     steps = rng.multivariate_normal(np.zeros(len(fit.covariance)), fit.covariance, DRAWS, method="eigh")
     drawn = [moved_rig(rig, fit.parameter_names, step) for step in steps]
-    errors = [pointing_error_px(one, rig, pair, pan, tilt, *clicked) for one in drawn for clicked in clicks]
+    size, rates, errors = np.array(rig.cameras[pair[0]].model.size_px), [], []
+    for k in range(0, len(landings.places), 13):  # of each place there is a click in each of four corners
+        pan, tilt, range_m = landings.places[k]
+        clicked = click(rig, pair, pan, tilt, size * CLICKS[k % 4], range_m)
+        errors += [pointing_error_px(one, rig, pair, pan, tilt, *clicked) for one in drawn]
+        rates.append(landings.to_rig[2 * k : 2 * k + 2])
+    some = replace(landings, to_rig=np.concatenate(rates))
     spread = float(np.sqrt(np.mean(np.square(errors))))
-    assert pointing_sigma_px(fit, pair) == pytest.approx(spread, rel=0.2), "the spread of 200 numbers: 5 %"
+    assert some.rms_px(covariance) == pytest.approx(spread, rel=0.2), "the spread of 200 numbers: 5 %"
 
 
 def test_a_turned_mast_changes_pointing_at_positions_but_not_at_clicks() -> None:
@@ -139,9 +142,9 @@ def test_what_the_papers_method_made_is_judged_by_the_joint_fits_tests(
     fitted: tuple[Survey, Calibration],
 ) -> None:
     survey = fitted[0]
-    told = replace(survey, sigma=replace(survey.sigma, station_m=survey.sigma.station_m / 4))
-    by_paper = fit_paper(told)
-    verdict = judge(told, by_paper, jointly=fit_joint(told))
+    stated = replace(survey, sigma=replace(survey.sigma, station_m=survey.sigma.station_m / 4))
+    by_paper = fit_paper(stated)
+    verdict = judge(stated, by_paper, jointly=fit_joint(stated))
     assert any(
         r.grade == "care" and r.sentence.startswith("fitted jointly, tapes scatter") for r in verdict.reasons
     )
