@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
 from mastctl.cli.options import command, option
-from mastctl.cli.output import Answer, Shown, WrongUse, check_file, check_folder, chosen, tables_of, unusable
+from mastctl.cli.output import (
+    Answer,
+    Shown,
+    WrongUse,
+    check_file,
+    check_folder,
+    tables_at,
+    tables_of,
+    unusable,
+)
 
 if TYPE_CHECKING:
     from calib.files.mast_file import StoredRig
@@ -123,7 +132,7 @@ def _refine(args: argparse.Namespace) -> Answer:
         "other_mast": proposal.other_mast,
     }
     shown: list[str | Shown] = [
-        *tables_of(chosen(document, REFINED)),
+        *tables_at(document, REFINED),
         *(one.sentence for one in proposal.bias),
         f"{proposal.mast.path} is as it was; a daemon uses the new one after 'mastctl rig mast use'",
     ]

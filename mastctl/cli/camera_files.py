@@ -9,17 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
-from mastctl.cli.mast_files import (
+from mastctl.cli.geometry import (
     camera_name,
     camera_of,
-    chosen_camera,
     need_joints,
     read_mast_file,
     stereo_pair,
     tell_notes,
 )
 from mastctl.cli.options import at_least, command, option
-from mastctl.cli.output import Answer, CommandError, WrongUse
+from mastctl.cli.output import Answer, CommandError, WrongUse, tables_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -151,12 +150,8 @@ def camera_convert(args: argparse.Namespace) -> Answer:
     }
     document: dict[str, Any] = {"out": str(done.path), "format": done.format, "frame": frame}
     document |= {"lost": list(done.lost), "notes": notes} | ({"cameras": errors} if errors else {})
-    lines = [f"{done.path}: {done.format}, frame '{frame}'"]
-    for name, error in errors.items():
-        lens = f", {error['lens']}" if error["lens"] else ""
-        size = f"worst {error['worst_px']:.2g} px, {error['rms_px']:.2g} px rms over the image"
-        lines.append(f"{name}{lens}: {size}")
-    return Answer(document, [*lines, *notes, *done.lost])
+    line = f"{done.path}: {done.format}, frame '{frame}'"
+    return Answer(document, [line, *tables_of(errors, "errors"), *notes, *done.lost])
 
 
 def _chosen_model(args: argparse.Namespace) -> CameraModel:
@@ -189,6 +184,11 @@ def _chosen_model(args: argparse.Namespace) -> CameraModel:
 )
 def camera_maps(args: argparse.Namespace) -> Answer:
     """Write the maps, the new camera's matrix and vectors, and for a pair OpenCV's Q."""
+    import io
+
+    import numpy as np
+
+    from calib.files import save_bytes
     from calib.geometry.maps import ideal_camera, maps_between, rectified_pair
 
     if args.out.suffix != ".npz":
@@ -196,7 +196,10 @@ def camera_maps(args: argparse.Namespace) -> Answer:
     output.check_file(args.out, "--out")
     arrays: dict[str, np.ndarray] = {}
     if args.pair is None:
-        name, camera = chosen_camera(args.file, args.camera)
+        from calib.files.any_camera import load_any
+
+        name, camera = camera_of(load_any(args.file), args.camera)
+        tell_notes(camera.notes)
         new = ideal_camera(camera.model, args.focal_px)
         maps = maps_between(new, camera.model)
         arrays |= {"map_x": maps.map_x, "map_y": maps.map_y, **_camera_arrays(new, "")}
@@ -221,11 +224,11 @@ def camera_maps(args: argparse.Namespace) -> Answer:
                 **_camera_arrays(new, f"{side}_"),
             }
         frame, shown = left.on, dict(zip(names, (pair.left_maps, pair.right_maps), strict=True))
-    _save_maps(args.out, arrays)
+    archive = io.BytesIO()
+    np.savez_compressed(archive, **arrays)  # type: ignore[arg-type]  # names are names
+    save_bytes(args.out, archive.getvalue())
     seen = {name: float((maps.map_x >= 0.0).mean()) for name, maps in shown.items()}
-    lines = [f"{args.out}: {', '.join(arrays)}; vectors in '{frame}'"]
-    lines += [f"{name}: {part:.0%} of the new picture is shown by the old one" for name, part in seen.items()]
-    return Answer({"out": str(args.out), "frame": frame, "arrays": sorted(arrays), "shown": seen}, lines)
+    return Answer({"out": str(args.out), "frame": frame, "arrays": sorted(arrays), "shown": seen})
 
 
 def _camera_arrays(camera: CameraModel, before: str) -> dict[str, np.ndarray]:
@@ -236,18 +239,6 @@ def _camera_arrays(camera: CameraModel, before: str) -> dict[str, np.ndarray]:
     fx, fy = camera.focal_px
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
     return {f"{before}K": matrix, **{f"{before}{letter}": getattr(camera, letter) for letter in "CAHV"}}
-
-
-def _save_maps(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    import io
-
-    import numpy as np
-
-    from calib.files import save_bytes
-
-    archive = io.BytesIO()
-    np.savez_compressed(archive, **arrays)  # type: ignore[arg-type]  # names are names
-    save_bytes(path, archive.getvalue())
 
 
 @command(
@@ -286,7 +277,12 @@ def camera_mode(args: argparse.Namespace) -> Answer:
     rig = rig_in_mode(stored.rig, name, mode)
     size_px = rig.cameras[name].model.size_px
     if args.size is not None and size_px != tuple(args.size):
-        raise CommandError("bad_mode", _other_size(args.size, size_px, calibrated_px, str(mode)))
+        raise CommandError(
+            "bad_mode",
+            f"{mode or 'the calibrated mode'} makes {size_px[0]}x{size_px[1]} px of "
+            f"{calibrated_px[0]}x{calibrated_px[1]} px where the pictures have "
+            f"{args.size[0]}x{args.size[1]} px: state how they are made by --crop or --bin",
+        )
     if not str(mode):
         raise WrongUse("--crop, --bin or --flip is expected: the calibrated mode needs no other file")
     if args.out.exists() and args.out.samefile(args.file):
@@ -302,15 +298,3 @@ def camera_mode(args: argparse.Namespace) -> Answer:
         document | {"digest": written.digest},
         f"{args.out}: {name} with {mode}: {size_px[0]}x{size_px[1]} px",
     )
-
-
-def _other_size(size: list[int], size_px: tuple[int, int], full_px: tuple[int, int], mode: str) -> str:
-    """Why pictures of a size are not those of a mode."""
-    made = f"{mode or 'the calibrated mode'} gives {size_px[0]}x{size_px[1]} px"
-    comes = f"{made} where the pictures have {size[0]}x{size[1]} px"
-    across, down = (full / now for full, now in zip(full_px, size, strict=True))
-    if across == down and across == int(across) and across > 1:
-        return f"{comes}; they may be binned by {int(across)} or cropped: say which with --bin or --crop"
-    if across != down:
-        return f"{comes}; no binning alone changes {full_px[0]}x{full_px[1]} px to that shape: say its --crop"
-    return f"{comes}; a scale of 1/{across:g} is no binning, and how the camera makes it is not known"

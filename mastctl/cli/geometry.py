@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import math
+from collections.abc import Collection, Iterable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli.mast_files import camera_name, nearest_of, need_joints, read_mast_file, stereo_pair
 from mastctl.cli.options import command, option, positive_number
-from mastctl.cli.output import Answer, Shown, WrongUse, tables_of
+from mastctl.cli.output import Answer, WrongUse, tables_at, tell
 
 if TYPE_CHECKING:
-    from calib.geometry.handoff import Handoff, Joints
+    from calib.files import CameraFile
+    from calib.files.mast_file import StoredRig
+    from calib.geometry.handoff import Handoff
     from calib.geometry.rig import Rig
 
 MAST = option("MAST.yaml", "the mast file")
@@ -36,7 +38,7 @@ PRESENT = "present angle; solutions near it come first"
     example="mast.yaml --camera navcam_left --target 6 1 0",
 )
 def solve_pointing(args: argparse.Namespace) -> Answer:
-    """Solve for the joint angles that bring a target in the rover frame onto a pixel."""
+    """Solve for the joint angles that bring a target in the rover frame onto a pixel, the best first."""
     from calib.geometry.pointing import solve
 
     stored = read_mast_file(args.mast)
@@ -47,23 +49,7 @@ def solve_pointing(args: argparse.Namespace) -> Answer:
         stored.rig.mast, camera.model, args.target, args.pixel,
         from_pan_rad=args.from_pan, from_tilt_rad=args.from_tilt,
     )  # fmt: skip
-    x, y = camera.model.image_center_px if args.pixel is None else args.pixel
-    target = ", ".join(f"{value:g}" for value in args.target)
-    rows = [
-        (
-            *(f"{angle:.9f}" for angle in (one.pan_rad, one.tilt_rad)),
-            *(f"{math.degrees(angle):.4f}" for angle in (one.pan_rad, one.tilt_rad)),
-            f"{one.range_m:.6f}",
-        )
-        for one in solutions
-    ]
-    shown = Shown(
-        f"{stored.rig.name}: target ({target}) m on pixel ({x:g}, {y:g}) of {args.camera}",
-        ("pan rad", "tilt rad", "pan deg", "tilt deg", "range m"),
-        rows,
-        ["best first; the mast's limits belong to a configuration and are not applied"],
-    )
-    return Answer({"solutions": solutions}, shown)
+    return Answer({"solutions": solutions})
 
 
 @command(
@@ -81,37 +67,23 @@ def triangulate_pair(args: argparse.Namespace) -> Answer:
     rig, pair = stored.rig, stereo_pair(stored, args.pair)
     for name in pair:
         need_joints(rig, name, args)
-    seen, gap = clicked_point(
+    seen, _ = clicked_point(
         rig, pair, args.pan or 0.0, args.tilt or 0.0, args.left, args.right,
         sigma_px=args.sigma_px, calibration=stored_covariance(rig),
     )  # fmt: skip
-    sigmas_mm = [1e3 * math.sqrt(max(0.0, variance)) for variance in seen.covariance_m2.diagonal()]
     document = {
-        "position_m": seen.position_m,
-        "covariance_m2": seen.covariance_m2,
-        "ray_gap_m": seen.ray_gap_m,
-    }
-    axes = zip("xyz", document["position_m"], sigmas_mm, strict=True)
-    shown = Shown(
-        f"{rig.name}: the point that {args.pair} sees, in the rover frame",
-        ("", "m", "sigma mm"),
-        [(axis, f"{value:.6f}", f"{sigma:.3f}") for axis, value, sigma in axes],
-        [
-            f"ray gap {1e3 * seen.ray_gap_m:.3f} mm, {gap.sigmas:.1f} sigma; "
-            f"sigma from {args.sigma_px:g} px in each pixel coordinate"
-        ],
-    )
-    return Answer(document, shown)
+        "position_m": seen.position_m, "covariance_m2": seen.covariance_m2, "ray_gap_m": seen.ray_gap_m
+    }  # fmt: skip
+    sigmas_m = seen.covariance_m2.diagonal().clip(0.0) ** 0.5
+    return Answer(document, tables_at(document | {"sigma_m": sigmas_m}, "position_m sigma_m ray_gap_m"))
 
 
 @command("budget")
 def error_budget(args: argparse.Namespace) -> Answer:
-    """Compute the paper's Table I."""
+    """Compute the paper's Table I: target approach from 10 m to 1 m, 3-sigma errors."""
     from calib.geometry.stereo import target_approach_budget
 
-    rows = [row._asdict() for row in target_approach_budget()]
-    title = "Target approach from 10 m to 1 m, 3-sigma errors (Table I of the paper)"
-    return Answer({"cameras": rows}, tables_of({title: rows}))
+    return Answer({"cameras": [row._asdict() for row in target_approach_budget()]})
 
 
 @command(
@@ -126,7 +98,7 @@ def error_budget(args: argparse.Namespace) -> Answer:
     example="mast.yaml --from navcam --to hazcam --pan 0.3 --tilt -0.2 --left 300 420 --right 271 420",
 )
 def hand_over(args: argparse.Namespace) -> Answer:
-    """Hand a target over, geometrically, with the ellipse to search."""
+    """Hand a target over, geometrically, with the covariance of where to search."""
     from calib.geometry.covariance import stored_covariance
     from calib.geometry.handoff import Joints, hand_off
 
@@ -139,22 +111,15 @@ def hand_over(args: argparse.Namespace) -> Answer:
     for name in (*pair, *to):
         need_joints(rig, name, args)
     joints = Joints(args.pan or 0.0, args.tilt or 0.0, args.sigma_joint or 0.0)
-    calibration = stored_covariance(rig)
-    done = hand_off(
-        rig, pair, to, joints, args.left, args.right,
-        to_joints=_destination(args, joints),
-        sigma_px=args.sigma_px, calibration=calibration,
-    )  # fmt: skip
-    return Answer(_as_json(done), _shown(args, rig, done))
-
-
-def _destination(args: argparse.Namespace, joints: Joints) -> Joints | None:
-    """The joint angles of the destination images; None where the head does not turn."""
-    from calib.geometry.handoff import Joints
-
     pan = joints.pan_rad if args.to_pan is None else args.to_pan
     tilt = joints.tilt_rad if args.to_tilt is None else args.to_tilt
-    return None if (pan, tilt) == (joints.pan_rad, joints.tilt_rad) else Joints(pan, tilt, joints.sigma_rad)
+    turned = (pan, tilt) != (joints.pan_rad, joints.tilt_rad)
+    done = hand_off(
+        rig, pair, to, joints, args.left, args.right,
+        to_joints=Joints(pan, tilt, joints.sigma_rad) if turned else None,
+        sigma_px=args.sigma_px, calibration=stored_covariance(rig),
+    )  # fmt: skip
+    return Answer(_as_json(done))
 
 
 def _as_json(done: Handoff) -> dict[str, Any]:
@@ -181,36 +146,73 @@ def _as_json(done: Handoff) -> dict[str, Any]:
     }
 
 
-def _shown(args: argparse.Namespace, rig: Rig, done: Handoff) -> Shown:
-    import numpy as np
+def read_mast_file(path: Path) -> StoredRig:
+    """Read a mast file, with its notes on stderr, for stdout holds the result."""
+    from calib.files.mast_file import load_rig
 
-    rows = []
-    for name, seen in done.pixels.items():
-        if seen is None:
-            rows.append((name, "not seen", "", "", ""))
-            continue
-        values, vectors = np.linalg.eigh(seen.search_px2)
-        major, minor = (3.0 * math.sqrt(max(v, 0.0)) for v in values[::-1])
-        angle = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1])) % 180.0
-        rows.append(
-            (
-                name,
-                f"{seen.pixel_px[0]:.2f}",
-                f"{seen.pixel_px[1]:.2f}",
-                f"{major:.2f} x {minor:.2f}",
-                f"{angle:.0f}",
-            )
-        )
-    x, y, z = done.seen.position_m
-    notes = [f"{name}: {why}" for name, why in done.reasons.items()]
-    notes.append(f"head at pan {done.pan_rad:.6f}, tilt {done.tilt_rad:.6f} rad")
-    gap = f"{1e3 * done.seen.ray_gap_m:.2f} mm, {done.gap.sigmas:.1f} sigma"
-    notes.append(f"target at ({x:.4f}, {y:.4f}, {z:.4f}) m, rover frame; rays pass at {gap}")
-    sources = ["clicks"] + ["joints"] * bool(args.sigma_joint) + ["calibration"] * ("covariance" in rig.fit)
-    notes.append(f"3-sigma half axes of where to search, from {', '.join(sources)}; angle from x towards y")
-    return Shown(
-        f"{rig.name}: from {args.source} to {args.to}",
-        ("camera", "x px", "y px", "search px", "angle deg"),
-        rows,
-        notes,
-    )
+    stored = load_rig(path)
+    tell_notes(stored.notes)
+    return stored
+
+
+def tell_notes(notes: Iterable[str]) -> None:
+    """Write on stderr what reading a file changed."""
+    for note in notes:
+        tell(note)
+
+
+def camera_name(stored: StoredRig, name: str | None) -> str:
+    """Return the camera of this name, the only one by default. Raises WrongUse."""
+    return _named(name, stored.rig.cameras, str(stored.path))
+
+
+def _named(name: str | None, cameras: Collection[str], where: str) -> str:
+    if name is None and len(cameras) == 1:
+        return next(iter(cameras))
+    if name is None:
+        known = f"--camera with one of {', '.join(cameras)}" if cameras else "one is expected"
+        raise WrongUse(f"{where} holds {len(cameras)} cameras; {known}")
+    if name not in cameras:
+        raise WrongUse(f"no camera '{name}' in {where}; {nearest_of(name, cameras)}")
+    return name
+
+
+def stereo_pair(stored: StoredRig, name: str) -> tuple[str, str]:
+    """Return the cameras (left, right) of a stereo pair. Raises WrongUse."""
+    stereo = stored.rig.stereo
+    if name not in stereo:
+        raise WrongUse(f"no stereo pair '{name}' in {stored.path}; {nearest_of(name, stereo)}")
+    return stereo[name]
+
+
+def need_joints(rig: Rig, name: str, args: argparse.Namespace) -> None:
+    """Refuse a camera on the head without --pan and --tilt. Raises WrongUse."""
+    if rig.cameras[name].on == "head" and (args.pan is None or args.tilt is None):
+        raise WrongUse(f"camera '{name}' is on the head; --pan RAD and --tilt RAD are expected")
+
+
+def nearest_of(name: str, known: Collection[str]) -> str:
+    """Return the nearest of the known names, or all, as a hint."""
+    from calib.files.yaml_text import nearest
+
+    return nearest(name, list(known)) if known else "it has none"
+
+
+def camera_of(
+    source: StoredRig | CameraFile | dict[str, CameraFile], name: str | None
+) -> tuple[str, CameraFile]:
+    """Return the camera that is meant, and its name. Raises WrongUse."""
+    from calib.files import CameraFile
+
+    if isinstance(source, CameraFile):
+        if name is not None:
+            raise WrongUse("the file holds one camera without a name; leave --camera out")
+        return "camera", source
+    if isinstance(source, dict):
+        name = _named(name, source, str(next(iter(source.values())).path))
+        return name, source[name]
+    name = camera_name(source, name)
+    camera = source.rig.cameras[name]
+    provenance = {"mast_file_sha256": source.digest, **source.rig.provenance}
+    left_out = ("the mast file's 'fit' is left out",) if source.rig.fit else ()
+    return name, CameraFile(camera.model, camera.on, {}, provenance, source.notes + left_out)

@@ -65,7 +65,7 @@ def show(args: argparse.Namespace, answer: Answer) -> int:
 
         _print_json(as_json(answer.document))
     else:
-        shown = tables_of(answer.document) if answer.shown is None else answer.shown
+        shown = tables_at(answer.document) if answer.shown is None else answer.shown
         for one in [shown] if isinstance(shown, (str, Shown)) else shown:
             if isinstance(one, Shown):
                 _print_table(one)
@@ -74,6 +74,14 @@ def show(args: argparse.Namespace, answer: Answer) -> int:
                 sys.stdout.write(" " * indent + one_line(one) + "\n")
     sys.stdout.flush()
     return answer.code
+
+
+def tables_at(document: Mapping[str, Any], keys: str = "", title: str = "") -> list[Shown]:
+    """Return a record as tables: its values at these keys as of `chosen`, or all of it."""
+    from mastctl.as_json import as_json
+
+    plain = as_json(document)
+    return tables_of(chosen(plain, keys) if keys else plain, title)
 
 
 def chosen(document: Mapping[str, Any], keys: str) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from mastctl.cli import output
 from mastctl.cli.daemon import CONFIG, DAEMON, URL, client_of
 from mastctl.cli.options import GROUPS, Option, command, finite_number, option
-from mastctl.cli.output import Answer, CommandError, WrongUse, check_file, chosen, tables_of
+from mastctl.cli.output import Answer, CommandError, WrongUse, check_file, tables_at
 
 if TYPE_CHECKING:
     from mastctl.client import Client
@@ -52,7 +52,7 @@ class Request(NamedTuple):
             answer = self.send(client, args)
         if self.line:
             return Answer(answer, self.line.format_map(answer))
-        return Answer(answer, tables_of(chosen(answer, self.keys)) if self.keys else None)
+        return Answer(answer, tables_at(answer, self.keys))
 
 
 def _mast(client: Client, args: argparse.Namespace) -> Mapping[str, Any]:

@@ -15,7 +15,7 @@ from mastctl import signals
 from mastctl.cli import output
 from mastctl.cli.daemon import DAEMON, client_of, followed, queue_output
 from mastctl.cli.options import command, one_of, option
-from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, cell, chosen, tables_of
+from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, cell, chosen, tables_at
 from mastctl.logs import QueuedHandler
 
 if TYPE_CHECKING:
@@ -119,11 +119,11 @@ def _status(args: argparse.Namespace) -> Answer | int:
             return show_each(args, map(_event, client.events(*args.events, keys=args.key)))
         if args.operations:
             listed = {"operations": client.operations()}
-            return Answer(listed, tables_of(chosen(listed, LISTED)))
+            return Answer(listed, tables_at(listed, LISTED))
         if args.operation is not None:
             return _operation(args, client)
         status = client.status() if args.wait is None else _ready(client, args.wait)
-    return Answer(status, tables_of(chosen(status, STATUS), f"mastctl at {client.url}"))
+    return Answer(status, tables_at(status, STATUS, f"mastctl at {client.url}"))
 
 
 def _ready(client: Client, wait_s: float) -> Status:
@@ -165,7 +165,7 @@ def _operation(args: argparse.Namespace, client: Client) -> Answer:
 
 def operation_shown(record: Mapping[str, Any], more: str = "") -> list[Shown]:
     """Return an operation for people: its request, what was measured, and ``more`` keys."""
-    return tables_of(chosen(record, f"{OPERATION} {more}"), f"operation {record['id']}")
+    return tables_at(record, f"{OPERATION} {more}", f"operation {record['id']}")
 
 
 def _event(event: Mapping[str, Any]) -> Answer:

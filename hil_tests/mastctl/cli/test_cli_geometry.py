@@ -154,7 +154,7 @@ def test_triangulate_finds_the_point_and_how_well(folder: Path, capsys: pytest.C
     assert twice["covariance_m2"][0][0] == pytest.approx(
         4 * json.loads(run.out)["covariance_m2"][0][0], rel=1e-9
     )
-    assert "11.000000" in Run(words, capsys).out
+    assert "11, 2, -3" in Run(words, capsys).out
 
 
 def test_budget_is_the_papers_table_1(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
