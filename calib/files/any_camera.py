@@ -240,7 +240,7 @@ def nearest_lens(
                     twin = twin if to == "cahvor" or _is_square(twin) else nearest_square(twin)
                 else:
                     twin = nearest_opencv(model, LENSES[name])
-                error = twin_error(model, twin, model.moving)
+                error = twin_error(model, twin)
         except (ValueError, np.linalg.LinAlgError) as reason:
             problem = str(reason)
             continue

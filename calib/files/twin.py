@@ -75,14 +75,12 @@ class TwinError:
     """How far one camera is from another over their whole image.
 
     ``worst_px`` and ``rms_px`` are of the distances between pixels, both ways: a ray of the one seen by the
-    other; infinite where the other does not see it. ``worst_at_px`` is the pixel where it is worst. ``blind``
-    is the part of the image that has no ray in the first camera; nothing is compared there.
+    other; infinite where the other does not see it. Nothing is compared where the first camera has no ray.
     """
 
     worst_px: float
     rms_px: float
     worst_at_px: tuple[float, float]
-    blind: float
 
 
 def error_sentence(error: TwinError) -> str:
@@ -102,33 +100,25 @@ def grid_px(size_px: tuple[int, int], counts: tuple[int, int], margin_px: float 
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
 
 
-def twin_error(camera: CameraModel, twin: CameraModel, near: bool = False) -> TwinError:
+def twin_error(camera: CameraModel, twin: CameraModel) -> TwinError:
     """Return how far ``twin`` is from ``camera`` (of one size, in one frame), over the image to its outer
-    border.
-
-    With ``near`` points 1 m away count too: they do where an entrance point moves.
+    border; if an entrance point moves, for points 1 m away too.
     """
     pixels = grid_px(camera.size_px, (38, 31), 0.5)  # but for the corners none of those of a fit
-    far, blind = [], 0.0
-    for one, other in ((camera, twin), (twin, camera)):
+    far = np.zeros((2, len(pixels)))
+    for off, one, other in zip(far, (camera, twin), (twin, camera), strict=True):
         rays = one.ray(pixels)
-        if one is camera:
-            blind = float(1.0 - rays.valid.mean())
-            compared = rays.valid
-        off = np.zeros(len(pixels))
-        for range_m in RANGES_M if near else RANGES_M[1:]:
+        for range_m in RANGES_M if camera.moving else RANGES_M[1:]:
             seen, valid = other.project(rays.origins_m[rays.valid] + range_m * rays.directions[rays.valid])
             moved = np.where(valid, np.linalg.norm(seen - pixels[rays.valid], axis=1), np.inf)
             off[rays.valid] = np.maximum(off[rays.valid], moved)
         off[~rays.valid] = np.inf
-        far.append(off[compared])
+    compared = camera.ray(pixels).valid
     if not compared.any():
-        return TwinError(np.inf, np.inf, (np.nan, np.nan), 1.0)
-    worst = np.maximum(*far)
-    at = pixels[compared][int(worst.argmax())]
-    return TwinError(
-        float(worst.max()), float(np.sqrt(np.mean(worst**2))), (float(at[0]), float(at[1])), blind
-    )
+        return TwinError(np.inf, np.inf, (np.nan, np.nan))
+    worst = far.max(axis=0)[compared]
+    x, y = pixels[compared][int(worst.argmax())].tolist()
+    return TwinError(float(worst.max()), float(np.sqrt(np.mean(worst**2))), (x, y))
 
 
 def even_axes(model: CameraModel, z: FloatArray | None = None) -> FloatArray:
@@ -152,7 +142,7 @@ def nearest_opencv(model: CameraModel, kind: Kind) -> CameraModel:
     if (same := as_kind(model, kind)) is not None:
         return same
     found = _fit(_plain_start(model, kind), *seen, move=model.moving)
-    error = twin_error(model, found, model.moving)
+    error = twin_error(model, found)
     if COEFFICIENTS[kind] < 8 or error.worst_px <= GOOD_PX:
         return found
     # From the plain start a fraction's poles may come to lie in the image, and no step leads out again.
@@ -160,7 +150,7 @@ def nearest_opencv(model: CameraModel, kind: Kind) -> CameraModel:
     numbers = np.pad(five.distortion, (0, COEFFICIENTS[kind] - 5))
     start = CameraModel.of_matrix(kind, model.size_px, five.camera_matrix, numbers, five.rotation, five.C)
     other = _fit(start, *seen, move=model.moving)
-    return other if twin_error(model, other, model.moving).worst_px < error.worst_px else found
+    return other if twin_error(model, other).worst_px < error.worst_px else found
 
 
 def _plain_start(model: CameraModel, kind: Kind) -> CameraModel:

@@ -10,7 +10,7 @@ centre.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -73,7 +73,10 @@ def find_dots(
         found = Candidates(found.middles_px + np.array([left, top]), found.shapes_px)
         grid, reached = best_grid(image, found, board)
         if isinstance(grid, BoardGrid):
-            ordered = _ordered(grid, board, expected, steps_px)
+            if isinstance(expected, Upright):
+                ordered = order_by_gravity(grid, board, expected)
+            else:
+                ordered = order_by_steps(grid, board, np.eye(2) if steps_px is None else steps_px)
             result = (
                 CornersNotFound(
                     "the grid is found but not which corner is the first: it stands aslant against "
@@ -102,24 +105,12 @@ def in_8_bits(image: Levels) -> Grey8:
     return np.asarray(np.clip(np.rint(spread), 0, 255), dtype=np.uint8)
 
 
-def _ordered(
-    grid: BoardGrid,
-    board: DotBoard,
-    expected: PredictedBoard | Upright | None,
-    steps_px: FloatArray | None,
-) -> Ordered | None:
-    """Rows and columns of the grid's dots, or None if not sure."""
-    if isinstance(expected, Upright):
-        return order_by_gravity(
-            grid.places, grid.counts, grid.middles_px, board, expected.camera, expected.down_in_board
-        )
-    steps = grid.map.jacobian((np.array(grid.counts) - 1) / 2)
-    return order_by_steps(grid.places, grid.counts, steps, board, np.eye(2) if steps_px is None else steps_px)
-
-
-def _measured(image: Levels, board: DotBoard, grid: BoardGrid, ordered: Ordered) -> Dots | CornersNotFound:
+def _measured(
+    image: Levels, board: DotBoard, grid: BoardGrid, ordered: tuple[IntArray, IntArray]
+) -> Dots | CornersNotFound:
     """Fit every dot of the grid and correct for the shape of circles."""
-    points = board.dots_in_board_m(ordered.rows, ordered.columns)[:, :2]
+    rows, columns = ordered
+    points = board.dots_in_board_m(rows, columns)[:, :2]
     radius = board.dot_diameter_m / 2
     first = fit_plane_map(points, grid.middles_px)
     if first is None:
@@ -161,81 +152,87 @@ def _measured(image: Levels, board: DotBoard, grid: BoardGrid, ordered: Ordered)
             break
         good &= ~far
     return Dots(
-        ordered.rows[good],
-        ordered.columns[good],
+        rows[good],
+        columns[good],
         centres[good],
         scale * sigma[good],
     )
 
 
-class Ordered(NamedTuple):
-    """columns, rows (n,) of dots whose places were given, and by how much the grid is turned, rad."""
-
-    columns: IntArray
-    rows: IntArray
-    turned_rad: float
-
-
 def order_by_steps(
-    places: IntArray, counts: tuple[int, int], steps_px: FloatArray, board: DotBoard, expected_px: FloatArray
-) -> Ordered | None:
-    """Count rows and columns so that their directions in the image are nearest to the expected ones.
+    grid: BoardGrid, board: DotBoard, expected_px: FloatArray
+) -> tuple[IntArray, IntArray] | None:
+    """Return rows and columns (n,) so that their directions in the image are nearest to the expected ones.
 
-    ``places`` (n, 2) are i and j of each dot, 0 to ``counts`` - 1; ``steps_px`` (2, 2) the steps of i and j
-    in the image, as columns; ``expected_px`` (2, 2) where the steps of columns and rows should point, as
-    columns. None if no way to count fits within ``SURE_RAD``.
+    ``expected_px`` (2, 2) is where the steps of columns and rows should point, as columns. None if no way to
+    count fits within ``SURE_RAD``.
     """
-    orders: list[Ordered] = []
-    for columns, rows, c_from_ij in _countings(places, counts, board):
-        found = steps_px @ np.linalg.inv(c_from_ij)
+    steps_px = grid.map.jacobian((np.array(grid.counts) - 1) / 2)
+
+    def turn_rad(order: _Counting) -> float | None:
+        found = steps_px @ np.linalg.inv(order.step_from_ij)
         if np.linalg.det(found) * np.linalg.det(expected_px) <= 0.0:
-            continue
-        turned = _turn_of(found @ np.linalg.inv(expected_px))
-        orders.append(Ordered(columns, rows, turned))
-    return _surest(orders)
+            return None
+        turn = found @ np.linalg.inv(expected_px)  # the angle of the nearest rotation
+        return float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
+
+    return _surest(grid, board, turn_rad)
 
 
-def order_by_gravity(
-    places: IntArray,
-    counts: tuple[int, int],
-    middles_px: FloatArray,
-    board: DotBoard,
-    camera: CameraModel,
-    down_in_board: FloatArray,
-) -> Ordered | None:
-    """Count rows and columns so that the camera that took the picture stands upright.
+def order_by_gravity(grid: BoardGrid, board: DotBoard, upright: Upright) -> tuple[IntArray, IntArray] | None:
+    """Return rows and columns (n,) so that the camera that took the picture stands upright.
 
-    ``camera`` is a rough one in its own frame (x right, y down, z along A); ``down_in_board`` (3,) is the
-    direction in the board's frame that is down in an upright camera's image. Other arguments and the result
-    as ``order_by_steps``. None also if the camera looks down so steeply that its uprightness shows nothing.
+    None as of `order_by_steps`, and if the camera looks down so steeply that its uprightness shows nothing.
     """
-    from_places = _camera_from_places(camera, places, middles_px)
+    from_places = _camera_from_places(upright.camera, grid.places, grid.middles_px)
     if from_places is None:
         return None
-    orders: list[Ordered] = []
-    for columns, rows, c_from_ij in _countings(places, counts, board):
+
+    def turn_rad(order: _Counting) -> float | None:
         affine = np.eye(3)  # from metres on the board to (i, j)
-        shift = np.array([columns[0], rows[0]]) - c_from_ij @ places[0]
+        undo = np.linalg.inv(order.step_from_ij)
+        shift = np.array([order.columns[0], order.rows[0]]) - order.step_from_ij @ grid.places[0]
         middle = np.array([board.columns - 1, board.rows - 1]) / 2
-        affine[:2, :2] = np.linalg.inv(c_from_ij) / board.spacing_m
-        affine[:2, 2] = np.linalg.inv(c_from_ij) @ (middle - shift)
+        affine[:2, :2], affine[:2, 2] = undo / board.spacing_m, undo @ (middle - shift)
         H = from_places @ affine
         H = H / np.linalg.norm(H[:, 0])
         if np.linalg.det(H) <= 0.0:  # seen from behind
-            continue
+            return None
         U, _, Vt = np.linalg.svd(np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])]))
-        down = U @ Vt @ down_in_board
+        down = U @ Vt @ upright.down_in_board
         if np.hypot(down[0], down[1]) < 0.3:  # so little of the vertical in the image shows nothing
+            return None
+        return float(np.arctan2(-down[0], down[1]))
+
+    return _surest(grid, board, turn_rad)
+
+
+class _Counting(NamedTuple):
+    """A way to count: columns and rows (n,), and (2, 2) from steps of (i, j) to steps of these."""
+
+    columns: IntArray
+    rows: IntArray
+    step_from_ij: FloatArray
+
+
+def _surest(
+    grid: BoardGrid, board: DotBoard, turn_rad: Callable[[_Counting], float | None]
+) -> tuple[IntArray, IntArray] | None:
+    """Rows and columns of the way to count that is turned least, if it is near enough."""
+    turned: list[tuple[float, _Counting]] = []
+    last = np.array(grid.counts) - 1
+    for swap in (False, True):
+        if (grid.counts[::-1] if swap else grid.counts) != (board.columns, board.rows):
             continue
-        turned = float(np.arctan2(-down[0], down[1]))
-        orders.append(Ordered(columns, rows, turned))
-    return _surest(orders)
-
-
-def _surest(orders: list[Ordered]) -> Ordered | None:
-    """The order that is turned least, if it is near enough."""
-    best = min(orders, key=lambda one: abs(one.turned_rad), default=None)
-    return best if best is not None and abs(best.turned_rad) < SURE_RAD else None
+        for flips in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            flipped = np.where(flips, last - grid.places, grid.places)
+            columns, rows = flipped.T[::-1] if swap else flipped.T
+            signs = np.diag([-1.0 if flip else 1.0 for flip in flips])
+            order = _Counting(columns, rows, signs[::-1] if swap else signs)
+            if (turn := turn_rad(order)) is not None:
+                turned.append((abs(turn), order))
+    least = min(turned, key=lambda one: one[0], default=None)
+    return None if least is None or least[0] >= SURE_RAD else (least[1].rows, least[1].columns)
 
 
 def _camera_from_places(camera: CameraModel, places: IntArray, middles_px: FloatArray) -> FloatArray | None:
@@ -261,28 +258,6 @@ def expected_steps_px(camera: CameraModel, frame_from_board: Rigid) -> FloatArra
     return np.asarray(jacobian @ frame_from_board.rotation[:, :2]) if valid else None
 
 
-def _countings(
-    places: IntArray, counts: tuple[int, int], board: DotBoard
-) -> list[tuple[IntArray, IntArray, FloatArray]]:
-    """All ways to count: columns (n,), rows (n,) and the matrix from steps of (i, j) to (column, row)."""
-    countings = []
-    last = np.array(counts) - 1
-    for swap in (False, True):
-        if (counts[::-1] if swap else counts) != (board.columns, board.rows):
-            continue
-        for flips in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            flipped = np.where(flips, last - places, places)
-            c, r = flipped.T[::-1] if swap else flipped.T
-            signs = np.diag([-1.0 if f else 1.0 for f in flips])
-            countings.append((c, r, signs[::-1] if swap else signs))
-    return countings
-
-
-def _turn_of(matrix: FloatArray) -> float:
-    """The angle of the rotation nearest to a (2, 2) matrix of positive determinant."""
-    return float(np.arctan2(matrix[1, 0] - matrix[0, 1], matrix[0, 0] + matrix[1, 1]))
-
-
 @dataclass(frozen=True, eq=False)
 class PredictedBoard:
     """Where the board should be: a rough camera, and the board's pose in the frame of its vectors."""
@@ -293,7 +268,11 @@ class PredictedBoard:
 
 @dataclass(frozen=True, eq=False)
 class Upright:
-    """Only that the camera stands upright; ``camera`` and ``down_in_board`` as for ``order_by_gravity``."""
+    """Only that the camera stands upright.
+
+    ``camera`` is a rough one in its own frame (x right, y down, z along A); ``down_in_board`` (3,) the
+    direction in the board's frame that is down in an upright camera's image.
+    """
 
     camera: CameraModel
     down_in_board: FloatArray

@@ -95,11 +95,8 @@ def test_a_skew_of_h_and_v_is_what_a_square_twin_misses_by() -> None:
 
 def test_an_error_knows_of_a_camera_that_does_not_see_all_of_the_image() -> None:
     folding = camera([-0.4, 0.0, 0.0, 0.0], focal=300.0)
-    error = twin_error(
-        folding, CameraModel("CAHV", (640, 480), C=[0, 0, 0], A=[0, 0, 1], H=[9, 0, 1], V=[0, 9, 1])
-    )
-    assert 0.1 < error.blind < 0.9
     assert twin_error(plain("CAHV"), folding).worst_px == np.inf
+    assert twin_error(folding, folding).worst_px < 1e-6
 
 
 def general(linearity: float, focal: float, skew_rad: float) -> CameraModel:
