@@ -297,7 +297,7 @@ def _views(survey: Survey, images: list[ImageTerm]) -> dict[str, ViewPoses]:
     for name in dict.fromkeys(t.camera for t in images):
         camera, mine = survey.cameras[name], [t for t in images if t.camera == name]
         try:
-            views[name] = view_poses(mine, camera.kind, camera.size_px, camera.focal_px or None)
+            views[name] = view_poses(mine, camera.kind, camera.size_px, camera.focal_px)
         except ViewsTooFew as error:
             raise BenchNotFitted(f"camera {name}: {error}") from None
     return views

@@ -3,8 +3,8 @@
 Each view (a camera at a rest of the head) is taken again; its features have moved by little. A robust fit
 turns them into four numbers: shift x and y of the picture's middle, a turn about it, a change of scale.
 Things that moved by themselves (rocks, shadows' edges) are left out there. The numbers of all views are then
-tested against what one change would do to them: a camera turned in the head, a lens refocused, a joint
-slipped, the rover turned under the mast. The likeliest counts; which one it was is not reported. Light and
+tested against what one change would do to them: a camera turned or refocused, a joint slipped, the rover
+turned under the mast. The likeliest counts; which one it was is not reported. Light and
 weather spoil a view as a whole, so each view has an error of its own beside that of its features, and each
 rest one of both joints.
 """
@@ -21,7 +21,6 @@ import numpy as np
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.covariance import JOINT_NAMES, pixel_rates
-from calib.geometry.parameters import focus_and_turn_rates, parameter_names
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, rigid_rates
 from calib.geometry.significance import MEDIAN_OF_TWO, chance, sigmas
@@ -143,35 +142,29 @@ def find_drift(rig: Rig, shifts: Sequence[ViewShift], joint_sigma_rad: float = J
     ``shifts`` are of each camera at each rest once; ``joint_sigma_rad`` is what a rest of the head is off by
     chance, then and now, one sigma.
     """
-    compared: list[tuple[ViewShift, ViewChange]] = []
-    silent = []
-    for shift in shifts:
-        change = view_change(shift, rig.cameras[shift.camera].model.size_px)
-        if change is None:
-            silent.append(f"{shift.camera} at rest {shift.pose}")
-        else:
-            compared.append((shift, change))
+    found = [(shift, view_change(shift, rig.cameras[shift.camera].model.size_px)) for shift in shifts]
+    compared = [(shift, change) for shift, change in found if change is not None]
+    silent = tuple(f"{shift.camera} at rest {shift.pose}" for shift, change in found if change is None)
+    drift = SceneDrift(len(compared), silent)
     if not compared:
-        return SceneDrift(0, tuple(silent))
+        return drift
     y = np.concatenate([change.numbers for _, change in compared])
     columns = _columns(rig, [shift for shift, _ in compared])
-    covariance = _noise(compared, columns, joint_sigma_rad)
-    inverse = np.linalg.inv(covariance)
+    inverse = np.linalg.inv(_noise(compared, columns, joint_sigma_rad))
     sizes_px = [rig.cameras[shift.camera].model.size_px for shift, _ in compared]
     corner_px = np.array([np.hypot(width, height) / 2.0 for width, height in sizes_px])
-    per_number = float(np.log(len(y)))  # what a number more must explain: Schwarz's criterion
-    best, drift = -np.inf, SceneDrift(len(compared), tuple(silent))
+    best = -np.inf
     for rates in columns.values():
         normal = rates.T @ inverse @ rates
         if np.linalg.cond(normal) > 1e12:
             continue
         values = np.linalg.solve(normal, rates.T @ inverse @ y)
-        gain = float(values @ normal @ values)
-        left = max(float(y @ inverse @ y) - gain, 0.0)
-        freedom = max(len(y) - len(values), 1)
-        scale = max(1.0, left / freedom)
-        if gain / scale - per_number * len(values) > best:
-            best = gain / scale - per_number * len(values)
+        gain, freedom = float(values @ normal @ values), max(len(y) - len(values), 1)
+        scale = max(1.0, (float(y @ inverse @ y) - gain) / freedom)
+        # What a number more must explain: Schwarz's criterion.
+        worth = gain / scale - float(np.log(len(y))) * len(values)
+        if worth > best:
+            best = worth
             x, y_px, turn, scaled = (rates @ values).reshape(-1, 4).T
             moved_px = float((np.hypot(x, y_px) + corner_px * np.hypot(turn, scaled)).max())
             by_chance = sigmas(chance(gain, len(values), scale, freedom))
@@ -196,32 +189,27 @@ def _noise(
 
 
 def _columns(rig: Rig, shifts: Sequence[ViewShift]) -> dict[str, FloatArray]:
-    """By change that is tested: how the views' numbers follow those that change (4v, k)."""
+    """By change that is tested: how the views' numbers follow those that change (4v, k).
+
+    A camera that is turned in the head or refocused changes all its views alike.
+    """
     views = [_responses(rig, shift) for shift in shifts]
-    shapes = {name: rates.shape for view in views for name, rates in view.items()}
-    return {
-        name: np.concatenate([view.get(name, np.zeros(shape)) for view in views])
-        for name, shape in shapes.items()
-    }
+    found = {name: np.concatenate([view[name] for view in views]) for name in ("pan", "tilt", "rover")}
+    for camera in dict.fromkeys(shift.camera for shift in shifts):
+        mine = [float(shift.camera == camera) for shift in shifts]
+        found[camera] = np.kron(np.array(mine)[:, None], np.eye(4))
+    return found
 
 
 def _responses(rig: Rig, shift: ViewShift) -> dict[str, FloatArray]:
-    """By change that is tested: how a view's four numbers, taken from its own features, follow it (4, k)."""
-    camera = rig.cameras[shift.camera]
+    """How a view's four numbers, taken from its own features, follow joints and rover (4, k)."""
     rays = rig.camera_in_rover(shift.camera, shift.pan_rad, shift.tilt_rad).ray(shift.pixels_px)
     points = rays.origins_m + _ranges_m(rays.origins_m, rays.directions)[:, None] * rays.directions
-    own = [f"cameras.{shift.camera}.{part}" for part in parameter_names(camera.model.kind)]
-    seen = pixel_rates(rig, (*JOINT_NAMES, *own), shift.camera, shift.pan_rad, shift.tilt_rad, points)
+    seen = pixel_rates(rig, JOINT_NAMES, shift.camera, shift.pan_rad, shift.tilt_rad, points)
     # The rover carries the camera: points move the other way before it.
     by_rover = -rigid_rates(seen.to_points, points, np.zeros(3))[..., :3]
     moved_px = {"pan": seen.to_rig[..., :1], "tilt": seen.to_rig[..., 1:2], "rover": by_rover}
-    if camera.on == "head":
-        by_camera = seen.to_rig[..., 2:] @ focus_and_turn_rates(camera.model)
-        moved_px |= {
-            f"scale of {shift.camera}": by_camera[..., :1],
-            f"turn of {shift.camera}": by_camera[..., 1:],
-        }
-    rates = _rates(shift.pixels_px, camera.model.size_px).reshape(-1, 4)
+    rates = _rates(shift.pixels_px, rig.cameras[shift.camera].model.size_px).reshape(-1, 4)
     return {
         name: np.asarray(np.linalg.lstsq(rates, np.nan_to_num(moved).reshape(len(rates), -1), rcond=None)[0])
         for name, moved in moved_px.items()

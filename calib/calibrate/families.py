@@ -49,7 +49,7 @@ class FamilyScore:
 def compare_families(
     images: Sequence[ImageTerm],
     size_px: tuple[int, int],
-    focal_px: float | None,
+    focal_px: float,
     kinds: Sequence[Kind] = FAMILIES,
 ) -> tuple[FamilyScore, ...]:
     """Return how well each family predicts the images of one camera, in the order of ``kinds``.

@@ -29,7 +29,7 @@ def compared(survey: Survey) -> dict[str, tuple[FamilyScore, ...]]:
     for name, camera in survey.cameras.items():
         mine = [term for term in terms if term.camera == name]
         if len(mine) >= FOLDS:
-            found[name] = compare_families(mine, camera.size_px, camera.focal_px or None)
+            found[name] = compare_families(mine, camera.size_px, camera.focal_px)
     return found
 
 

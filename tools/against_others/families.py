@@ -177,7 +177,9 @@ def boards_residuals(problem: Adjustment, state: Estimate) -> np.ndarray:
 
 def fit_ours(kind: Kind, size_px: tuple[int, int], terms: Sequence[ImageTerm]) -> tuple[float, str]:
     """Return the rms of our camera and boards, and a note if the fit did not settle; or CalibError."""
-    found = view_poses(terms, kind, size_px, None)
+    points = [term.in_board_m.astype(np.float32) for term in terms]
+    pixels = [term.pixels_px.astype(np.float32) for term in terms]
+    found = view_poses(terms, kind, size_px, cv2.initCameraMatrix2D(points, pixels, size_px)[0, 0])
     terms = [term for term in terms if term.name in found.poses]
     boards = {term.board: found.poses[term.name][0] for term in terms}
     start = Estimate({"camera": found.model}, rover_from_board=boards)

@@ -1,14 +1,13 @@
 """Where a board stood in front of a camera, image by image, with nothing known but a rough focal length.
 
-A camera with free boards (Zhang 1999) starts from the focal length that the homographies of its images say,
-or from the rough one, and ends with its own lens; each image then gives camera_from_board (IPPE, Collins and
-Bartoli 2014), both of its solutions where a small or distant board looks nearly the same from two sides.
+A camera with free boards (Zhang 1999) starts from the rough focal length and ends with its own lens; each
+image then gives camera_from_board (IPPE, Collins and Bartoli 2014), both of its solutions where a small or
+distant board looks nearly the same from two sides.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import cv2
@@ -52,14 +51,14 @@ def view_poses(
     images: Sequence[ImageTerm],
     kind: Kind,
     size_px: tuple[int, int],
-    focal_px: float | None,
+    focal_px: float,
     *,
     images_for_lens: int = IMAGES_FOR_LENS,
 ) -> ViewPoses:
     """Return a camera and where the board, which is flat, stood in each of its images.
 
-    The focal length may be some 20 % off, or None where nothing is known of it. The lens is fitted to
-    ``images_for_lens`` of the images at most. Raises ViewsTooFew if no camera explains the images.
+    The focal length may be some 20 % off. The lens is fitted to ``images_for_lens`` of the images at most.
+    Raises ViewsTooFew if no camera explains the images.
     """
     clean = [t for t in without_wrong(images)[0] if t.keep.sum() >= FEWEST_POINTS]
     if not clean:
@@ -68,7 +67,7 @@ def view_poses(
     some = [clean[i] for i in np.unique(spread)]
     models = (
         centred_camera(kind, size_px, focal, 2 if kind == "CAHVORE" else 0)
-        for focal in _focal_lengths(clean, size_px, focal_px)
+        for focal in (focal_px, 0.8 * focal_px, 1.25 * focal_px)
     )
     stated_px = float(np.median(np.concatenate([t.sigma_px for t in some])))
     best = best_agreeing((_free_boards(some, model) for model in models), stated_px)
@@ -86,29 +85,6 @@ def view_poses(
     limit = gross_limit(list(off.values()), 1.0) if off else 0.0
     doubtful = {t.name for t in images if t.name not in off or off[t.name] > limit}
     return ViewPoses(model, poses, frozenset(doubtful))
-
-
-def _focal_lengths(
-    images: Sequence[ImageTerm], size_px: tuple[int, int], focal_px: float | None
-) -> list[float]:
-    """Focal lengths to start from, the likeliest first."""
-    found = _focal_of_homographies(images, size_px)
-    if focal_px is None:
-        return [*([found] if found else []), 0.9 * max(size_px), 1.5 * max(size_px)]
-    near = [found] if found and 0.6 < found / focal_px < 1.7 else []
-    return [focal_px, *near, 0.8 * focal_px, 1.25 * focal_px]
-
-
-def _focal_of_homographies(images: Sequence[ImageTerm], size_px: tuple[int, int]) -> float | None:
-    """The focal length of the typical slanted board, centre and square pixels taken for granted."""
-    found = []
-    for term in images:
-        points = term.in_board_m[term.keep].astype(np.float32)
-        pixels = term.pixels_px[term.keep].astype(np.float32)
-        with suppress(cv2.error):  # all of its corners may be on one line: it has no homography
-            found.append(cv2.initCameraMatrix2D([points], [pixels], size_px)[0, 0])
-    good = [f for f in found if np.isfinite(f) and 0.1 < f / max(size_px) < 20.0]
-    return float(np.median(good)) if good else None
 
 
 def _free_boards(images: Sequence[ImageTerm], start: CameraModel) -> tuple[Adjustment, Estimate]:

@@ -358,7 +358,7 @@ def test_an_image_of_one_row_of_corners_fixes_nothing_and_harms_nothing() -> Non
                 pixels[some, 0], np.full(some.sum(), 0.1), np.ones(some.sum(), dtype=bool),
             )
         )  # fmt: skip
-    views = view_poses(terms, "CAHV", (1024, 768), None)
+    views = view_poses(terms, "CAHV", (1024, 768), 850.0)
     assert np.linalg.norm(np.cross(views.model.A, views.model.H)) == pytest.approx(1000.0, rel=0.01)
 
 
