@@ -185,7 +185,7 @@ class Adjustment:
         return self._copy(images=tuple(images), station=tuple(station))
 
     def with_sigmas(self, factors: Mapping[str, float]) -> Adjustment:
-        """Return the same problem with sigmas times ``factors``, by kind (``calib.adjust.goodness``)."""
+        """Return the same problem with sigmas times ``factors``, by kind (``calib.adjust.noise``)."""
         unknowns = {
             key: replace(one, sigma=one.sigma * factors.get(one.kind, 1.0))
             if one.sigma is not None and one.kind is not None

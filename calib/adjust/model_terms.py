@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from calib.adjust.adjustment import Adjustment
-from calib.adjust.goodness import goodness
+from calib.adjust.noise import goodness
 from calib.adjust.solver import Minimum
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate

@@ -21,7 +21,7 @@ the covariance I + J C Jᵀ, and with A = J L, L Lᵀ = C, Woodbury's identity g
 That is chi-square, and what the sum of squares falls by if the image is left out. It is the same number
 whether the image was fitted or not.
 
-A dot counts by its image's own sigma (`calib.adjust.scatter`), so that a noisy image fails nothing. A whole
+A dot counts by its image's own sigma (`calib.adjust.noise`), so that a noisy image fails nothing. A whole
 image fails by a coherent shift alone: what its dots scatter about a smooth map widens its limit, for some of
 them may be noisier than others, as corners whose edges run along rows of pixels are. Where a camera's typical
 dot is off by more than that, as with a lens that its model does not fit or a camera that changed, its limits
@@ -39,7 +39,7 @@ import numpy as np
 
 from calib.adjust.adjustment import Adjustment, bounded_weights
 from calib.adjust.gross import GROSS, MANY, Outlier, at_least_stated, chance_limit
-from calib.adjust.scatter import scatter
+from calib.adjust.noise import scatter
 from calib.adjust.terms import ImageTerm, StationTerm
 from calib.adjust.unknowns import Estimate, ResidualBlock
 from calib.geometry.rigid import FloatArray

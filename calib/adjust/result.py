@@ -8,10 +8,10 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from calib.adjust.goodness import Component
 from calib.adjust.gross import Outlier
 from calib.adjust.hypotheses import Finding
 from calib.adjust.model_terms import TermGain
+from calib.adjust.noise import Component
 from calib.adjust.unknowns import Estimate
 from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import FloatArray, Rigid

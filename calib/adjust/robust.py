@@ -1,9 +1,9 @@
 """A fit without its blunders, every kind of measurement weighed by what its residuals show.
 
-Pulls are bounded first (Huber). Every image then says how noisy its dots are (`calib.adjust.scatter`), so
+Pulls are bounded first (Huber). Every image then says how noisy its dots are (`calib.adjust.noise`), so
 that blunders can be found by the tests of `calib.adjust.outliers`; then plain least squares without them.
 Where residuals show that a kind of measurement is worse than stated, the fit is done again with the sigma
-that they show (`calib.adjust.goodness`), and so is its covariance.
+that they show (`calib.adjust.noise`), and so is its covariance.
 """
 
 from __future__ import annotations
@@ -17,10 +17,17 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calib.adjust.adjustment import HUBER, Adjustment
-from calib.adjust.goodness import Component, found_sigmas, goodness, variance_components
 from calib.adjust.hypotheses import ScoredFit, find_contradictions
+from calib.adjust.noise import (
+    Component,
+    found_sigmas,
+    goodness,
+    own_scales,
+    scattering,
+    variance_components,
+    with_scales,
+)
 from calib.adjust.outliers import judge, name_outliers
-from calib.adjust.scatter import own_scales, scattering, with_scales
 from calib.adjust.solver import Minimum, minimise
 from calib.adjust.terms import ImageTerm, StationTerm, scattered_images, widened_images
 from calib.adjust.uncertainty import fitted_fields, image_residuals, open_directions
@@ -166,7 +173,7 @@ def without_blunders(
     """Fit with pulls bounded, find each image's sigma, judge, and fit again until nothing fails.
 
     ``problem`` has stated sigmas, ``all_images`` are its images with every dot, ``start`` is a state that
-    blunders may have moved, ``order_px`` as of `calib.adjust.scatter.with_scales`.
+    blunders may have moved, ``order_px`` as of `calib.adjust.noise.with_scales`.
     """
     fit = minimise(problem, start, weak=problem.weak, gain=1e-7)
     _refuse_lost(fit)

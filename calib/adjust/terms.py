@@ -27,7 +27,7 @@ class ImageTerm:
     standstill, None for a body camera and -1 where it is not fitted. ``approach`` says from where pan and
     tilt came to rest (+1: from smaller readings, -1: from larger, 0: not known). ``bend`` (n, 2) is what a
     bow of one moves each point by, back from the board; ``ids`` (n,) are a bench's corners. ``scatter`` is by
-    what ``sigma_px`` was multiplied for this image beside others of its camera (``calib.adjust.scatter``).
+    what ``sigma_px`` was multiplied for this image beside others of its camera (``calib.adjust.noise``).
     """
 
     name: str

@@ -20,6 +20,7 @@ from calib.adjust.adjustment import HUBER, SCAN_HUBER, Adjustment
 from calib.adjust.gross import gross_limit
 from calib.adjust.hypotheses import ScoredFit, find_change, find_drifts
 from calib.adjust.model_terms import ModelTerm, candidate_terms, choose_terms, term_numbers
+from calib.adjust.noise import print_error_m, with_scales, without_wrong
 from calib.adjust.result import BenchCalibration
 from calib.adjust.robust import (
     SurveyNotFitted,
@@ -29,7 +30,6 @@ from calib.adjust.robust import (
     weighed_fields,
     without_blunders,
 )
-from calib.adjust.scatter import print_error_m, with_scales, without_wrong
 from calib.adjust.solver import minimise
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calib.adjust.adjustment import HUBER, SCAN_HUBER, Adjustment
-from calib.adjust.goodness import goodness
 from calib.adjust.gross import GROSS
 from calib.adjust.hypotheses import (
     Finding,
@@ -22,6 +21,7 @@ from calib.adjust.hypotheses import (
     find_change,
     survey_findings,
 )
+from calib.adjust.noise import goodness
 from calib.adjust.result import Calibration
 from calib.adjust.robust import (
     Cleaned,

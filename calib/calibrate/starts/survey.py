@@ -24,9 +24,9 @@ import numpy as np
 
 from calib.adjust.adjustment import Adjustment
 from calib.adjust.gross import Outlier, chance_limit
+from calib.adjust.noise import without_wrong
 from calib.adjust.outliers import name_outliers
 from calib.adjust.robust import SurveyNotFitted, judged
-from calib.adjust.scatter import without_wrong
 from calib.adjust.terms import ImageTerm, StationTerm, image_terms, station_terms
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.agreeing import Agreed

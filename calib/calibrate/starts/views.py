@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.adjust.adjustment import Adjustment
 from calib.adjust.gross import gross_limit
-from calib.adjust.scatter import without_wrong
+from calib.adjust.noise import without_wrong
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
 from calib.calibrate.starts.agreeing import best_agreeing

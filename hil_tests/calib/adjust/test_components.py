@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from calib.adjust.goodness import Component, found_sigmas, variance_components
+from calib.adjust.noise import Component, found_sigmas, variance_components
 from calib.adjust.result import Calibration
 from calib.adjust.terms import StationTerm
 from calib.adjust.unknowns import ResidualBlock

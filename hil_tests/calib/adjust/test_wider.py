@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calib.adjust.hypotheses import Score
 from calib.adjust.result import Calibration
-from calib.adjust.score import Score
 from calib.adjust.unknowns import ResidualBlock
 from calib.calibrate.survey import fit_joint
 from calib.geometry.rig import Rig

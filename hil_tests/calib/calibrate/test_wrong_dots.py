@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib.adjust.gross import Outlier
-from calib.adjust.scatter import without_wrong
+from calib.adjust.noise import without_wrong
 from calib.adjust.terms import image_terms
 from calib.calibrate.paper import fit_paper
 from calib.calibrate.starts.survey import station_poses

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.adjust.goodness import Component
 from calib.adjust.gross import Outlier
+from calib.adjust.noise import Component
 from calib.adjust.result import Calibration, Degenerate
 from calib.adjust.robust import SurveyNotFitted
 from calib.calibrate.paper import fit_paper
