@@ -6,7 +6,6 @@ by a few blunders.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -25,19 +24,14 @@ MANY = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Outlier:
-    """A measurement that was not used, and the test it failed.
+    """A measurement that was not used, and how far off it is.
 
-    ``statistic`` is the sum of squares of its standardised residuals, ``limit`` the most that it may be: at
-    the stated rate of false alarms, wider where the typical measurement is farther off than its sigma says;
-    not-a-number for an image that was left out with its board's tapes. ``size`` is how far off it is: pixels
-    (rms over an image, in the worst camera of a hand-off, across the epipolar line of its clicks) or metres;
-    not-a-number for an image whose board, as it is named, the camera cannot see.
+    ``size`` is in pixels (rms over an image, in the worst camera of a hand-off, across the epipolar line of
+    its clicks) or metres; not-a-number for an image whose board, as it is named, the camera cannot see.
     """
 
     kind: Literal["dot", "image", "tape", "prism", "hand-off", "clicks"]
     name: str
-    statistic: float
-    limit: float
     size: float
 
     @property
@@ -48,7 +42,7 @@ class Outlier:
         if self.kind == "clicks":
             return (
                 f"{self.name} was not used: its two clicks do not mean one point, they are {self.size:.1f} "
-                f"px apart across the epipolar line, {math.sqrt(self.statistic):.1f} sigma"
+                "px apart across the epipolar line"
             )
         if self.kind == "hand-off":
             return f"{self.name} is off by {self.size:.1f} px after the correction and was not used"

@@ -294,22 +294,20 @@ class ScoredFit:
         last = max(len(self.images) - 1, 1)
         self.elapsed = {image.name: k / last for k, image in enumerate(self.images)}
 
-    def rows(self, rates: Rates, only: Callable[[ImageTerm], bool] | None = None) -> list[Effect]:
-        """The images, or some, by the rates (m, k) of their residuals."""
+    def rows(
+        self, rates: Rates, *, camera: str = "", board: tuple[str, str] | None = None, head: bool = False
+    ) -> list[Effect]:
+        """Return the images, or those of a camera, a board or the head, by the rates (m, k) of residuals."""
         found = []
         for image, motions in zip(self.images, self.motions, strict=True):
-            if only is None or only(image):
+            if (
+                camera in ("", image.camera)
+                and board in (None, image.board)
+                and not (head and image.attitude is None)
+            ):
                 mine = rates(image, motions)
                 found.append(self._row(image, motions.block, mine, mine))
         return found
-
-    def of_camera(self, name: str, rates: Rates) -> list[Effect]:
-        """The images of one camera by the rates of their residuals."""
-        return self.rows(rates, lambda image: image.camera == name)
-
-    def of_board(self, board: tuple[str, str], rates: Rates) -> list[Effect]:
-        """The images of one board by the rates of their residuals."""
-        return self.rows(rates, lambda image: image.board == board)
 
     def _row(self, image: ImageTerm, block: ResidualBlock, rates: FloatArray, moves: FloatArray) -> Effect:
         sigma_px = np.repeat(image.sigma_px[image.keep], 2)[:, None]
@@ -324,44 +322,40 @@ class ScoredFit:
         was: sharp ones leave of a reading's rates in pixels next to nothing that no other unknown takes up.
         The first image of a standstill has the reading then, and the others have no residuals.
         """
+        if self.problem.joint_rad <= 0.0:
+            return self.rows(lambda _, motions: motions.head[:, PAN_TILT], head=True)
         known = {what.key: block for what, block in self.problem.known(self.state)}
         found = []
         for image, motions in zip(self.images, self.motions, strict=True):
-            if image.attitude is None:
-                continue
-            block, rates = motions.block, motions.head[:, PAN_TILT]
-            moves = rates
-            if self.problem.joint_rad > 0.0:
+            if image.attitude is not None:
                 key = ("attitude", image.attitude)
                 nothing = ResidualBlock(np.zeros(0), np.zeros((0, 2)), self.problem.at(key))
                 block = known.pop(key, nothing)
-                rates = -block.jacobian
-            found.append(self._row(image, block, rates, moves))
+                found.append(self._row(image, block, -block.jacobian, motions.head[:, PAN_TILT]))
         return found
 
     def gains(self, what: Hypothesis) -> list[tuple[int, Gain]]:
-        """What a hypothesis gains, by the group at which it is so, or from which on."""
-        fitted = len(self.gradient)
-        if what.course == "always":
-            measured = [(row.block, row.rates) for row in what.rows]
-            return [(0, self._gain(Score.of(measured, fitted)))] if measured else []
-        scores = [Score.of(((row.block, row.rates) for row in group), fitted) for group in what.groups]
-        if what.course == "once":
-            return [(at, self._gain(score)) for at, score in enumerate(scores)]
+        """Return what a hypothesis gains, by the group at which it is so, or from which on."""
+
+        def gain(score: Score) -> Gain:
+            return score.gain(self.covariance, self.gradient, self.least)
+
+        groups = [list(what.rows)] if what.course == "always" else what.groups
+        measured = [[(row.block, row.rates) for row in group] for group in groups if group]
+        scores = [Score.of(group, len(self.gradient)) for group in measured]
         if what.course == "each":
-            return [(0, self._gain(Score.side_by_side(scores)))]
+            return [(0, gain(Score.side_by_side(scores)))]
+        if what.course != "from":
+            return [(at, gain(score)) for at, score in enumerate(scores)]
         found, total = [], None
         side = 2 if self.problem.huber else 1  # where blunders were not left out, one picture may be one
         for at in range(len(scores) - 1, side - 1, -1):
             total = scores[at] if total is None else scores[at] + total
             if len(scores) - at >= side:
-                gain = self._gain(total)
-                if what.subject[:1] == ("board",) or np.linalg.norm(gain.values) <= LARGEST:
-                    found.append((at, gain))
+                mine = gain(total)
+                if what.subject[:1] == ("board",) or np.linalg.norm(mine.values) <= LARGEST:
+                    found.append((at, mine))
         return found
-
-    def _gain(self, score: Score) -> Gain:
-        return score.gain(self.covariance, self.gradient, self.least)
 
     def left(self, gain: Gain) -> float:
         """Chi-square over its degrees of freedom that a gain leaves."""
@@ -461,7 +455,7 @@ def _placements(fit: ScoredFit) -> Iterator[Hypothesis]:
 
     for board in boards if len(boards) > 1 else ():
         name = f"placement {board[1]} of {board[0]}"
-        yield Hypothesis(name, ("board", *board), fit.of_board(board, own), sentence)
+        yield Hypothesis(name, ("board", *board), fit.rows(own, board=board), sentence)
 
 
 def _changes(fit: ScoredFit) -> Iterator[Hypothesis]:
@@ -474,7 +468,7 @@ def _changes(fit: ScoredFit) -> Iterator[Hypothesis]:
 
     for board in dict.fromkeys(image.board for image in fit.images):
         if board not in fit.problem.fixed:
-            rows = fit.of_board(board, lambda image, motions: motions.block.rates(("board", image.board)))
+            rows = fit.rows(lambda image, motions: motions.block.rates(("board", image.board)), board=board)
             yield Hypothesis("board moved", ("board", *board), rows, sentence, "from")
     if not fit.problem.upright:
         yield from _axes(fit)
@@ -494,7 +488,7 @@ def _cameras(fit: ScoredFit, what: Literal["change", "drift"]) -> Iterator[Hypot
     """Of each camera that has images left that its focal length and direction are others."""
     course: Course = "from" if what == "change" else "always"
     for name in fit.cameras:
-        rows = fit.of_camera(name, lambda _, motions: motions.camera)
+        rows = fit.rows(lambda _, motions: motions.camera, camera=name)
         yield Hypothesis(f"{what} of {name}", ("camera", name), rows, SENTENCES["camera", what], course)
 
 
@@ -518,7 +512,7 @@ def _axes(fit: ScoredFit) -> Iterator[Hypothesis]:
 
 def _on_head(fit: ScoredFit, numbers: Sequence[int]) -> list[Effect]:
     """The head's images by some of the numbers that move it."""
-    return fit.rows(lambda _, motions: motions.head[:, numbers], lambda image: image.attitude is not None)
+    return fit.rows(lambda _, motions: motions.head[:, numbers], head=True)
 
 
 def _harmonics(fit: ScoredFit) -> Iterator[Hypothesis]:
@@ -561,7 +555,7 @@ def _lenses(fit: ScoredFit) -> Iterator[Hypothesis]:
             f"the rest over {name}'s image is not noise: its lens is bent otherwise than "
             f"{fit.state.cameras[name].kind} can be, or its dots are off in a pattern"
         )
-        yield Hypothesis(f"lens of {name}", (), fit.of_camera(name, bends), text)
+        yield Hypothesis(f"lens of {name}", (), fit.rows(bends, camera=name), text)
 
 
 def _board_shape(fit: ScoredFit) -> Iterator[Hypothesis]:

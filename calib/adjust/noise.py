@@ -306,7 +306,7 @@ def without_wrong(images: Sequence[ImageTerm]) -> tuple[list[ImageTerm], tuple[O
             clean[at] = replace(image, keep=image.keep & ~bad)
             for i in np.flatnonzero(bad):
                 name = f"image {image.name} {image.part(int(i))}"
-                outliers.append(Outlier("dot", name, float(statistic[i]), limit, float(off_px[i])))
+                outliers.append(Outlier("dot", name, float(off_px[i])))
     return clean, tuple(outliers)
 
 

@@ -33,7 +33,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -226,32 +225,25 @@ def judge(
 
 
 def name_outliers(
-    problem: Adjustment, state: Estimate, covariance: FloatArray, all_images: Sequence[ImageTerm]
+    problem: Adjustment, state: Estimate, all_images: Sequence[ImageTerm]
 ) -> tuple[Outlier, ...]:
-    """Return everything that the problem leaves out, with the statistic it was left out for and its limit."""
+    """Return everything that the problem leaves out, and how far off it is."""
     found: list[Outlier] = []
-    if all(t.keep.all() for t in problem.images) and all(p.keep for p in problem.station):
-        return ()
-    tests = _Tests(problem, state, covariance, all_images)
-    for index, (whole, term) in enumerate(zip(all_images, problem.images, strict=True)):
+    for whole, term in zip(all_images, problem.images, strict=True):
         if term.keep.all():
             continue
         off_px = problem.residuals(state, [whole])[0].reshape(-1, 2) * whole.sigma_px[:, None]
         if not term.keep.any():
-            _, statistic, limit, _ = tests.image(index)
             size = float(np.sqrt(np.mean(np.sum(off_px**2, axis=1))))
-            found.append(Outlier("image", f"image {term.name}", statistic, limit, size))
+            found.append(Outlier("image", f"image {term.name}", size))
             continue
         for row in np.flatnonzero(~term.keep):
-            name, size = f"image {term.name} {term.part(int(row))}", float(np.linalg.norm(off_px[row]))
-            found.append(
-                Outlier("dot", name, float(tests.dots[index][row]), tests.dot_limit(term.camera), size)
-            )
-    for point, (statistic, freedom) in zip(problem.station, tests.points, strict=True):
+            size = float(np.linalg.norm(off_px[row]))
+            found.append(Outlier("dot", f"image {term.name} {term.part(int(row))}", size))
+    for point in problem.station:
         if not point.keep:
             size = float(np.linalg.norm(problem.residuals(state, [point])[0]) * point.sigma_m)
-            kind: Literal["prism", "tape"] = "prism" if point.board is None else "tape"
-            found.append(Outlier(kind, point.name, statistic, tests.point_limit(freedom or 3), size))
+            found.append(Outlier("prism" if point.board is None else "tape", point.name, size))
     return tuple(found)
 
 

@@ -119,10 +119,6 @@ class FittedRig:
     contradictions: tuple[Finding, ...] = ()
     seconds: float
 
-    def widened(self, kind: str) -> float:
-        """Return by how much the fit takes a kind of measurement for worse than stated; 1 if it does not."""
-        return next((c.weighed for c in self.components if c.kind == kind), 1.0)
-
     def part(self, prefix: str) -> np.ndarray:
         """Return where the parameters that begin with ``prefix`` are, as indices."""
         return np.array([i for i, n in enumerate(self.parameter_names) if n.startswith(prefix)], dtype=int)

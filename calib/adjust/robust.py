@@ -132,7 +132,7 @@ def weighed_fields(
         "degrees_of_freedom": freedom,
         "chi2_probability": float(chdtrc(freedom, chi2)) if freedom > 0 else float("nan"),
         "components": weighed.components,
-        "outliers": name_outliers(problem, state, covariance, weighed.images),
+        "outliers": name_outliers(problem, state, weighed.images),
         "degenerate": open_directions(problem, covariance),
         "contradictions": find_contradictions(weighed.scored),
     }

@@ -271,7 +271,7 @@ def fit_body_pose(rig: Rig, cameras: Sequence[str], handoffs: Sequence[MatchedHa
     """
     every = body_sights(rig, cameras, handoffs)
     _enough(every)
-    keep, statistics, limits = _keep(every)
+    keep = _keep(every)
     if np.mean(~keep) > MOST_OUTLIERS:
         raise NoCorrection(
             "inconsistent",
@@ -287,15 +287,11 @@ def fit_body_pose(rig: Rig, cameras: Sequence[str], handoffs: Sequence[MatchedHa
             f"the fit of {' and '.join(cameras)} did not settle in {_STEPS} steps; the hand-offs hardly "
             "fix it",
         )
-    left_out = [
-        Outlier("clicks", one.name, gap.sigmas**2, MOST_SIGMAS**2, gap.across_px) for one, gap in every.apart
-    ]
+    left_out = [Outlier("clicks", one.name, gap.across_px) for one, gap in every.apart]
     at = every.equations(fit.step)
     for i in np.flatnonzero(~keep):
         off = float(np.linalg.norm(at.residual_px[i].reshape(-1, 2), axis=1).max())
-        left_out.append(
-            Outlier("hand-off", every.handoffs[i].name, float(statistics[i]), float(limits[i]), off)
-        )
+        left_out.append(Outlier("hand-off", every.handoffs[i].name, off))
     return _correction(used, fit, tuple(left_out))
 
 
@@ -362,13 +358,12 @@ def _fit(sights: BodySights, robust: bool = False) -> _BodyFit:
     return _BodyFit(step, before, at, scale, freedom, settled, covariance)
 
 
-def _keep(sights: BodySights) -> tuple[np.ndarray, FloatArray, FloatArray]:
-    """Which hand-offs agree, their statistics and limits (n,): the worst goes alone and the fit is done
-    again, and what passes comes back."""
+def _keep(sights: BodySights) -> np.ndarray:
+    """Which hand-offs (n,) agree: the worst goes alone, the fit is done again, and what passes comes
+    back."""
     limits = chdtri(2 * sights.seen.sum(axis=1), Level.MEASUREMENT / len(sights.handoffs))
     robust = _fit(sights, robust=True)
-    statistics = robust.after.normal()[2] / robust.scale
-    keep = statistics <= limits
+    keep = robust.after.normal()[2] / robust.scale <= limits
     for _ in range(len(keep)):
         if np.mean(~keep) > MOST_OUTLIERS:
             break
@@ -385,7 +380,7 @@ def _keep(sights: BodySights) -> tuple[np.ndarray, FloatArray, FloatArray]:
         if (new == keep).all():
             break
         keep = new
-    return keep, statistics, limits
+    return np.asarray(keep)
 
 
 def _correction(used: BodySights, fit: _BodyFit, outliers: tuple[Outlier, ...]) -> BodyPose:

@@ -112,11 +112,12 @@ def two_step_covariance(
 def _left_out(images: Sequence[ImageResiduals], start: Start) -> list[Outlier]:
     """The images left out, with how far they are off."""
     out = start.doubtful | {t.name for t in start.images if t.board in start.poses.bent}
-    found = []
-    for image in images:
-        if image.name in out:
-            in_sigmas = image.residuals_px / image.sigma_px[:, None]
-            size = float(np.sqrt(np.mean(np.sum(image.residuals_px**2, axis=1))))
-            square = float(np.sum(in_sigmas**2))
-            found.append(Outlier("image", f"image {image.name}", square, float("nan"), size))
-    return found
+    return [
+        Outlier(
+            "image",
+            f"image {image.name}",
+            float(np.sqrt(np.mean(np.sum(image.residuals_px**2, axis=1)))),
+        )
+        for image in images
+        if image.name in out
+    ]

@@ -23,7 +23,7 @@ from typing import Literal
 import numpy as np
 
 from calib.adjust.adjustment import Adjustment
-from calib.adjust.gross import Outlier, chance_limit
+from calib.adjust.gross import Outlier
 from calib.adjust.noise import without_wrong
 from calib.adjust.outliers import name_outliers
 from calib.adjust.robust import SurveyNotFitted, judged
@@ -79,13 +79,13 @@ def station_poses(survey: Survey) -> StationPoses:
         blunders = [
             blunder
             for setup, pose in alone.items()
-            for blunder in _left_out("prism", pose, survey.sigma.station_m, f"of set-up {setup}")
+            for blunder in _left_out("prism", pose, f"of set-up {setup}")
         ]
     boards, bent = {}, set()
     for (setup, placement), pose in station_from_board(survey, false_alarm=Level.GROSS).items():
         where = f"of placement {placement} (set-up {setup})"
         boards[setup, placement] = setups[setup] @ pose.b_from_a
-        blunders += _left_out("tape", pose, survey.sigma.station_m, where)
+        blunders += _left_out("tape", pose, where)
         if pose.doubt:
             bent.add((setup, placement))
             notes.append(f"the tapes {where} do not agree with the board's: {pose.doubt}")
@@ -116,17 +116,14 @@ def _together(
             f"the prisms' places did not settle in {fit.steps} steps: the set-ups stand too differently from "
             "the drawing; check the prisms' names and places"
         )
-    blunders = list(name_outliers(problem, fit.state, fit.covariance, ()))
+    blunders = list(name_outliers(problem, fit.state, ()))
     return fit.state.rover_from_station, fit.state.prisms_in_rover_m, blunders
 
 
-def _left_out(kind: Literal["prism", "tape"], pose: Alignment, sigma_m: float, where: str) -> list[Outlier]:
+def _left_out(kind: Literal["prism", "tape"], pose: Alignment, where: str) -> list[Outlier]:
     """The points that an alignment left out."""
-    limit, found = chance_limit(Level.GROSS, 1, 3), []
-    for name in pose.rejected:
-        off_m = float(np.linalg.norm(pose.residuals_m[pose.names.index(name)]))
-        found.append(Outlier(kind, f"{kind} {name} {where}", (off_m / sigma_m) ** 2, limit, off_m))
-    return found
+    off_m = dict(zip(pose.names, np.linalg.norm(pose.residuals_m, axis=1).tolist(), strict=True))
+    return [Outlier(kind, f"{kind} {name} {where}", off_m[name]) for name in pose.rejected]
 
 
 @dataclass(frozen=True, eq=False)

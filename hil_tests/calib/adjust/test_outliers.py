@@ -80,7 +80,6 @@ def test_a_wrong_tape_is_named_in_a_sentence(
         "tape b of placement mast-3 (set-up level) is off by "
         f"{1000 * fit.outliers[0].size:.1f} mm and was not used"
     )
-    assert fit.outliers[0].statistic > fit.outliers[0].limit
     assert_unharmed(fit, good)
 
 

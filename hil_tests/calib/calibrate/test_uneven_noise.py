@@ -56,7 +56,8 @@ def test_noisy_pictures_of_a_bench_count_with_their_own_sigma(what: str) -> None
     noisy = [i.name for i in survey.images if i.placement == "p2"][: None if what == "placement" else 1]
     fit = fit_bench(with_noise(survey, dict.fromkeys(noisy, 3.0), np.random.default_rng(1)))
     assert not [o.name for o in fit.outliers if o.kind == "image"]
-    times = {i.name: i.scatter * fit.widened(f"dots of {i.camera}") for i in fit.images}
+    weighed = {c.kind: c.weighed for c in fit.components}
+    times = {i.name: i.scatter * weighed[f"dots of {i.camera}"] for i in fit.images}
     assert np.median([times[name] for name in noisy]) == pytest.approx(3.0, rel=2 * FACTOR_WITHIN)
     assert np.median([t for name, t in times.items() if name not in noisy]) == pytest.approx(1.0, abs=0.05)
 

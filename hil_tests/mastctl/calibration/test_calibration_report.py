@@ -95,7 +95,7 @@ def test_the_worst_reason_decides(fitted: tuple[Survey, Calibration]) -> None:
     blind = judge(survey, replace(calibration, unseen_clicks=(lost,)))
     assert blind.grade == "bad"
     assert any("image7 cannot show check point brick" in reason.sentence for reason in blind.reasons)
-    prism = Outlier("prism", "prism p3 of set-up level", 50.0, 20.0, 0.02)
+    prism = Outlier("prism", "prism p3 of set-up level", 0.02)
     care = judge(survey, replace(calibration, outliers=(prism,)))
     assert care.grade == "care"
     assert "prism p3" in care.reasons[-1].sentence
