@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from calib.adjust.hypotheses import Finding
-from calib.adjust.noise import Component, as_one
 from calib.adjust.result import FittedRig, ImageResiduals
 from calib.adjust.terms import DOTS_OF, DRAWING, JOINTS
 from calib.survey.records import Survey

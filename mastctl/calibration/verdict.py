@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.adjust.goodness import Component, as_one
+from calib.adjust.noise import Component, as_one
 from calib.adjust.result import BenchCalibration, Calibration, FittedRig, ImageResiduals
 from calib.adjust.terms import PRISMS, TAPES
 from calib.errors import CalibError
