@@ -64,27 +64,6 @@ def test_exact_clicks_land_exactly_in_every_camera(rig: Rig, source: str) -> Non
             assert done.reasons[name]
 
 
-def drawn(
-    rig: Rig, known: RigCovariance, sigma_px: float, sigma_rad: float, moves: bool, draws: int
-) -> np.ndarray:
-    """Pixels (draws, 2, 2) minus exact ones, of hand-offs by a rig, readings and clicks that err."""
-    rng = np.random.default_rng(3)
-    there = Joints(0.14, -0.5) if moves else AT
-    exact = clicks(rig, PAIR, TARGET, AT)
-    wanted = clicks(rig, HAZCAMS, TARGET, there)
-    root = np.linalg.cholesky(known.covariance) if known.names else np.zeros((0, 0))
-    off = []
-    for _ in range(draws):
-        believed = moved_rig(rig, known.names, root @ rng.standard_normal(len(known.names)))
-        first, second = rng.normal(0.0, sigma_rad, (2, 2)) if sigma_rad else np.zeros((2, 2))
-        read = Joints(AT.pan_rad + first[0], AT.tilt_rad + first[1])
-        then = Joints(there.pan_rad + second[0], there.tilt_rad + second[1]) if moves else None
-        left, right = exact + rng.normal(0.0, sigma_px, (2, 2))
-        done = hand_off(believed, PAIR, HAZCAMS, read, left, right, to_joints=then)
-        off.append([done.pixels[n].pixel_px for n in HAZCAMS])  # type: ignore[union-attr]
-    return np.array(off) - wanted
-
-
 @pytest.fixture(scope="module")
 def uncertain(rig: Rig) -> RigCovariance:
     """A made-up calibration covariance with correlations, of mast and of four cameras."""
@@ -98,43 +77,6 @@ def uncertain(rig: Rig) -> RigCovariance:
     correlation = mixed @ mixed.T + 10 * np.eye(len(names))
     d = 1 / np.sqrt(np.diag(correlation))
     return RigCovariance(tuple(names), np.outer(d * sigma, d * sigma) * correlation)
-
-
-ONE_KIND = pytest.mark.long(4, "fewer kinds of errors; exact joints, and all kinds at once, are quick")
-
-
-@pytest.mark.parametrize(
-    ("calibrated", "sigma_rad", "moves"),
-    [
-        (False, 0.0, False),
-        (True, 3e-4, True),
-        pytest.param(False, 3e-4, False, marks=ONE_KIND),
-        pytest.param(False, 3e-4, True, marks=ONE_KIND),
-        pytest.param(True, 0.0, False, marks=ONE_KIND),
-        pytest.param(True, 3e-4, False, marks=ONE_KIND),
-    ],
-)
-def test_the_search_ellipse_is_that_of_drawn_errors(
-    rig: Rig, uncertain: RigCovariance, sigma_rad: float, moves: bool, calibrated: bool
-) -> None:
-    known = uncertain if calibrated else RigCovariance((), np.zeros((0, 0)))
-    left, right = clicks(rig, PAIR, TARGET, AT)
-    there = Joints(0.14, -0.5, sigma_rad) if moves else None
-    done = hand_off(
-        rig, PAIR, HAZCAMS, replace(AT, sigma_rad=sigma_rad), left, right,
-        to_joints=there, sigma_px=0.3, calibration=known if calibrated else None,
-    )  # fmt: skip
-    off = drawn(rig, known, 0.3, sigma_rad, moves, 500)
-    for index, name in enumerate(HAZCAMS):
-        predicted = done.pixels[name]
-        assert predicted is not None
-        distances = np.einsum(
-            "ni,ij,nj->n", off[:, index], np.linalg.inv(predicted.search_px2), off[:, index]
-        )
-        # The mean of 500 squared distances is 2, sigma 0.09: a covariance off by a factor of 1.2 fails.
-        assert abs(distances.mean() - 2.0) < 0.32, name
-        if not calibrated and sigma_rad == 0.0:
-            np.testing.assert_array_equal(predicted.covariance_px2, predicted.search_px2)
 
 
 def test_a_turn_of_the_whole_mast_does_not_touch_a_hand_off_on_the_head(rig: Rig) -> None:

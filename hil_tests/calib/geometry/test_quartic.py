@@ -13,30 +13,6 @@ NEAR = 1e-6
 SEEDS = 40
 
 
-def test_four_real_roots_are_all_found() -> None:
-    for seed in range(SEEDS):
-        roots = np.sort(np.random.default_rng(seed).uniform(-5.0, 5.0, 4))
-        if np.diff(roots).min() < 1e-2:
-            roots = np.array([-4.0, -1.0, 0.5, 3.0])
-        found = roots_between(tuple(np.poly(roots)), -6.0, 6.0)
-        np.testing.assert_allclose(found, roots, atol=NEAR, err_msg=f"seed {seed}")
-
-
-def test_complex_pairs_are_not_taken_for_roots() -> None:
-    for seed in range(SEEDS):
-        rng = np.random.default_rng(seed)
-        low, high = np.sort(rng.uniform(-5.0, 5.0, 2)) + np.array([0.0, 0.1])
-        real, imaginary = rng.uniform(-5.0, 5.0), rng.uniform(0.1, 3.0)
-        coefficients = np.poly([low, high, real + 1j * imaginary, real - 1j * imaginary]).real
-        found = roots_between(tuple(coefficients), -6.0, 6.0)
-        np.testing.assert_allclose(found, [low, high], atol=NEAR, err_msg=f"seed {seed}")
-
-
-def test_only_roots_inside_the_interval_come_back() -> None:
-    coefficients = tuple(np.poly([-3.0, -1.0, 1.0, 3.0]))
-    np.testing.assert_allclose(roots_between(coefficients, -2.0, 2.0), [-1.0, 1.0], atol=NEAR)
-
-
 @pytest.mark.parametrize("tiny", [0.0, 1e-300, 1e-30, 1e-15])
 def test_leading_coefficients_may_vanish(tiny: float) -> None:
     np.testing.assert_allclose(

@@ -66,18 +66,28 @@ def errors_of(matches: list[tuple[PatchMatch, np.ndarray]]) -> tuple[np.ndarray,
     return errors, np.array(normalised)
 
 
+def matched(
+    first: np.ndarray, second: np.ndarray, plane: TexturedPlane, count: int, guess: float = 0.0
+) -> list[tuple[PatchMatch, np.ndarray]]:
+    """Matches of pictures by the left and the turned camera over the plane, or over one across the sight that
+    is so much too far, each with the true place."""
+    rng, matches = np.random.default_rng(8), []
+    for _ in range(count):
+        pixel = np.array([rng.uniform(90, 270), rng.uniform(70, 210)])
+        point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
+        surface = Plane(point, plane.normal)
+        if guess:
+            surface = facing_plane(LEFT.model, pixel, (1.0 + guess) * float(np.linalg.norm(point)))
+        found = match_patch(LEFT.posed(first), pixel, surface, TURNED.posed(second), 15, PLANE)
+        assert found.verdict == "good", f"pixel {pixel}: {found.reason}"
+        matches.append((found, TURNED.pixel(point)))
+    return matches
+
+
 def test_patch_warped_over_a_guessed_plane_is_found_where_geometry_says() -> None:
     matches = []
-    rng = np.random.default_rng(3)
     for seed in (0, 1):
-        plane = wall(seed)
-        for _ in range(40):
-            pixel = np.array([rng.uniform(90, 270), rng.uniform(70, 210)])
-            point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
-            guess = facing_plane(LEFT.model, pixel, 1.01 * float(np.linalg.norm(point)))
-            found = match_patch(shot(LEFT, seed), pixel, guess, shot(TURNED, seed), 15, PLANE)
-            assert found.verdict == "good", f"seed 3, scene {seed}, pixel {pixel}: {found.reason}"
-            matches.append((found, TURNED.pixel(point)))
+        matches += matched(seen(LEFT, seed), seen(TURNED, seed), wall(seed), 40, guess=0.01)
     errors, normalised = errors_of(matches)
     assert np.abs(errors.mean(axis=0)).max() < MEAN_PX
     assert np.sqrt((errors**2).mean(axis=0)).max() < RMS_PX
@@ -86,16 +96,7 @@ def test_patch_warped_over_a_guessed_plane_is_found_where_geometry_says() -> Non
 
 
 def test_sigma_grows_with_noise_and_stays_honest() -> None:
-    plane, rng, matches = wall(2), np.random.default_rng(8), []
-    for _ in range(40):
-        pixel = np.array([rng.uniform(90, 270), rng.uniform(70, 210)])
-        point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
-        found = match_patch(
-            shot(LEFT, 2, 8.0), pixel, Plane(point, plane.normal), shot(TURNED, 2, 8.0), 15, PLANE
-        )
-        assert found.verdict == "good", found.reason
-        matches.append((found, TURNED.pixel(point)))
-    errors, normalised = errors_of(matches)
+    errors, normalised = errors_of(matched(seen(LEFT, 2, 8.0), seen(TURNED, 2, 8.0), wall(2), 40))
     assert 0.015 < np.sqrt((errors**2).mean()) < 0.1
     rms = np.sqrt((normalised**2).mean())
     assert HONEST[0] < rms < HONEST[1], rms
@@ -110,17 +111,8 @@ def shared_noise(image: np.ndarray, seed: int) -> np.ndarray:
 
 
 def test_noise_that_hangs_together_over_several_pixels_is_in_the_sigma() -> None:
-    plane, rng, matches = wall(2), np.random.default_rng(8), []
     first, second = shared_noise(seen(LEFT, 2, 0.0), 1), shared_noise(seen(TURNED, 2, 0.0), 2)
-    for _ in range(80):
-        pixel = np.array([rng.uniform(90, 270), rng.uniform(70, 210)])
-        point = plane.hit(LEFT.position_m, LEFT.rays(pixel))
-        found = match_patch(
-            LEFT.posed(first), pixel, Plane(point, plane.normal), TURNED.posed(second), 5, PLANE
-        )
-        assert found.verdict == "good", found.reason
-        matches.append((found, TURNED.pixel(point)))
-    _, normalised = errors_of(matches)
+    _, normalised = errors_of(matched(first, second, wall(2), 80))
     assert 0.8 < np.sqrt((normalised**2).mean()) < 1.15
 
 
