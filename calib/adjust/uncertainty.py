@@ -306,7 +306,7 @@ def pointing_covariance(
     rig = calibration.rig
     rays = rig.camera_in_rover(pair[0], pan_rad, tilt_rad).ray(left_px)
     target = rays.origins_m + range_m * rays.directions
-    by_rig = landing_rates(rig, calibration.parameter_names, pair, pan_rad, tilt_rad, target).to_rig
+    by_rig, _ = landing_rates(rig, calibration.parameter_names, pair, pan_rad, tilt_rad, target)
     return np.asarray(by_rig @ calibration.covariance @ by_rig.T)
 
 

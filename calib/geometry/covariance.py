@@ -313,15 +313,6 @@ def place_rates(
     return PlaceRates(to_clicks, -to_clicks @ np.concatenate([one.to_rig[0] for one in seen]))
 
 
-class LandingRates(NamedTuple):
-    """How far a target lands off, to first order: pixels for errors of the named parameters (2, p) and of the
-    clicks in k cameras (2, 2k); pixels a radian for pan and tilt at the click, and at the landing (2, 4)."""
-
-    to_rig: FloatArray
-    to_clicks: FloatArray
-    to_readings: FloatArray
-
-
 def landing_rates(
     rig: Rig,
     names: Sequence[str],
@@ -330,8 +321,10 @@ def landing_rates(
     tilt_rad: float,
     target_m: FloatArray,
     approaches: tuple[Approach, Approach] = (UNKNOWN, UNKNOWN),
-) -> LandingRates:
-    """Return how a target's landing in the middle of the first camera's image depends on what may be off.
+) -> tuple[FloatArray, FloatArray]:
+    """Return how a target's landing in the middle of the first camera's image depends on what may be off:
+    pixels for errors of the named parameters (2, p), and pixels a radian (2, 4) for pan and tilt at the
+    click, and at the landing.
 
     ``names`` (p,) are parameters of the rig that may be off (`pixel_rates`), ``cameras`` those of the head in
     which the target (3,), rover frame, is clicked at true angles: a pair, left one first, or one camera that
@@ -347,11 +340,8 @@ def landing_rates(
     if not np.isfinite(by_rig).all():
         raise CalibError(f"camera {camera} does not see the target where it should land")
     clicking = by_place @ place.to_rig
-    return LandingRates(
-        -(by_rig[:, :size] + clicking[:, :size]),
-        -by_place @ place.to_clicks,
-        -np.hstack([clicking[:, size:], by_rig[:, size:]]),
-    )
+    to_readings = np.hstack([clicking[:, size:], by_rig[:, size:]])
+    return -(by_rig[:, :size] + clicking[:, :size]), -to_readings
 
 
 MOST_SIGMAS = 3.2905

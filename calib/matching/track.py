@@ -1,7 +1,7 @@
 """A followed target: its place with covariance, the picture it is known by, and how motion carries both.
 
 A motion of the rover carries the target over and adds the motion's own covariance (`moved_track`).
-`calib.matching.look` finds it again.
+`calib.matching.search` finds it again.
 
 A place is followed only if it differs from its surroundings. A place that correlates with its own
 neighbourhood will be confused with it: an edge along its length, a pattern with its repetition. And a patch

@@ -22,7 +22,7 @@ from itertools import product
 import numpy as np
 
 from calib.errors import CalibError
-from calib.geometry.covariance import JOINT_NAMES, LandingRates, landing_rates, pixel_rates
+from calib.geometry.covariance import JOINT_NAMES, landing_rates, pixel_rates
 from calib.geometry.parameters import parameter_names, parameter_part
 from calib.geometry.rig import JOINTS_NAMES, Approach, Gimbal, Rig, gimbal, numbers_of
 from calib.geometry.rigid import FloatArray, Rigid, rigid_rates
@@ -155,7 +155,7 @@ STEPS = (5, 3)
 
 @dataclass(frozen=True)
 class Workspace:
-    """Where a rig points: joint angles at which targets are clicked, from where to where, and their ranges.
+    """Where a rig points: joint angles at which targets are clicked, from where to where.
 
     ``cameras`` are the clicked one, and its partner if there is one. A ``one_sided`` head approaches every
     goal from the same side by itself, so that backlash is no error.
@@ -164,7 +164,6 @@ class Workspace:
     cameras: tuple[str, ...]
     pan_rad: tuple[float, float]
     tilt_rad: tuple[float, float]
-    ranges_m: Sequence[float] = RANGES_M
     one_sided: bool = False
 
 
@@ -201,11 +200,11 @@ def pointing(known: Knowledge, where: Workspace) -> ExpectedPointing:
     """
     rig, camera = known.rig, where.cameras[0]
     size_px = np.array(rig.cameras[camera].model.size_px)
-    landings: list[LandingRates] = []
+    landings: list[tuple[FloatArray, FloatArray]] = []
     places: list[tuple[float, float, float]] = []
     side = 0
     pans, tilts = np.linspace(*where.pan_rad, STEPS[0]), np.linspace(*where.tilt_rad, STEPS[1])
-    for pan, tilt, range_m, click in product(pans.tolist(), tilts.tolist(), where.ranges_m, CLICKS):
+    for pan, tilt, range_m, click in product(pans.tolist(), tilts.tolist(), RANGES_M, CLICKS):
         # Backlash shows where click and landing were approached from different sides.
         side = 0 if where.one_sided else 1 if side != 1 else -1
         sides = (side, side), (-side, -side)
@@ -219,5 +218,5 @@ def pointing(known: Knowledge, where: Workspace) -> ExpectedPointing:
         places.append((pan, tilt, float(range_m)))
     if not landings:
         raise CalibError(f"camera {camera} can be pointed at nothing of the workspace")
-    to_rig, _, to_readings = (np.concatenate(part) for part in zip(*landings, strict=True))
+    to_rig, to_readings = (np.concatenate(part) for part in zip(*landings, strict=True))
     return ExpectedPointing(to_rig, to_readings, tuple(places))

@@ -23,7 +23,7 @@ from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
-from calib.matching import look as one_point
+from calib.matching import search as one_point
 from hil_tests.calib.adjust.small_surveys import survey_of
 from hil_tests.calib.calibrate.test_fit_camera import boards, fit_camera
 from hil_tests.calib.matching.handed_over import HAZCAMS, hand_offs, moved_hazcams, plain_rig, targets

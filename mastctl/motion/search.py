@@ -28,8 +28,8 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import stereo_range_error_m
 from calib.matching.handoff import MatchedHandoff, RefineSettings, matched_handoff, refine_handoff
-from calib.matching.look import seen_by
 from calib.matching.patch import PatchMatch
+from calib.matching.search import seen_by
 from calib.matching.track import Track, start_track
 from drivers.clock import Clock
 from mastctl.answers import CameraPixel, Step
@@ -62,7 +62,7 @@ class TrackSighting:
 
     ``reason`` is one sentence for a target that is lost. ``pair`` took the images; empty if none could.
     ``position_m`` is (3,) of the target afterwards, in the rover frame of the look, ``range_m`` from the
-    middle between the pair's cameras. ``chi2`` and ``renewed`` are as `calib.matching.look.TrackLook` has
+    middle between the pair's cameras. ``chi2`` and ``renewed`` are as `calib.matching.search.TrackSearch` has
     them. ``pose_doubt`` says what the images say against the pose; empty if they do not. ``matched`` is the
     target in the images of the pair before and of the next one, if both took some.
     """

@@ -12,7 +12,7 @@ range, so it is assumed, in two ways:
 - neighbours: the plane through the eight nearest other targets found in the first way, each at the range that
   its own two pixels tell, uncertain by 3 %. A target's own match never tells its range.
 
-The target then goes through `calib.matching.look.seen_by` with one eye: window by the covariance of the
+The target then goes through `calib.matching.search.seen_by` with one eye: window by the covariance of the
 position, patch warped over the plane, correlation, sub-pixel place, verdict, misfit. Residual: found less
 predicted, in x and y, and across the epipolar line, where an unknown range does not reach.
 
@@ -35,7 +35,7 @@ from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import triangulate
-from calib.matching.look import TrackLook, seen_by
+from calib.matching.search import TrackSearch, seen_by
 from calib.matching.track import KeyPicture, Track, TrackSettings
 from calib.matching.warp import Plane, carry
 from drivers.clock import ManualClock
@@ -156,7 +156,7 @@ def carried(
     )  # fmt: skip
 
 
-def _verdict(look: TrackLook) -> str:
+def _verdict(look: TrackSearch) -> str:
     verdict = look.found["second"].verdict
     return "misfit" if verdict == "good" and look.track.state == "lost" else verdict
 

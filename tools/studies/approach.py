@@ -24,7 +24,7 @@ from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import target_approach_budget
-from calib.matching.look import seen_by
+from calib.matching.search import seen_by
 from calib.matching.track import Track, moved_track, start_track
 from drivers.sim.placed import SceneSettings
 from drivers.sim.scene import build_scene

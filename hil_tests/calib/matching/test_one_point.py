@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import least_squares
 
-from calib.matching.look import one_point
+from calib.matching.search import one_point
 from hil_tests.calib.matching.textured_planes import Pinhole
 
 CAMERAS = [

@@ -12,9 +12,9 @@ from scipy import ndimage
 
 from calib.errors import CalibError
 from calib.geometry.rigid import Rigid, rot_y, rot_z
-from calib.matching.look import OnePoint, TrackLook, pose_doubt, seen_by
 from calib.matching.partner import find_partner
 from calib.matching.patch import match_patch
+from calib.matching.search import OnePoint, TrackSearch, pose_doubt, seen_by
 from calib.matching.track import SIZES, Track, TrackSettings, indistinct, moved_track, start_track
 from calib.matching.warp import Plane, PosedImage
 from hil_tests.calib.matching.textured_planes import Pinhole, TexturedPlane, picture, random_texture
@@ -102,7 +102,7 @@ def test_motion_carries_position_and_covariance(begun: Track) -> None:
 TOLD = np.diag([2e-3**2] * 3 + [0.015**2] * 3)
 
 
-def after_a_wrong_pose(begun: Track, wrong_m: list[float], covariance: NDArray[np.float64]) -> TrackLook:
+def after_a_wrong_pose(begun: Track, wrong_m: list[float], covariance: NDArray[np.float64]) -> TrackSearch:
     """A look 0.4 m nearer, after a pose that is ``wrong_m`` off."""
     said = Rigid(np.eye(3), np.array([0.4, 0.0, 0.0]) + wrong_m)
     return seen_by(moved_track(begun, said.inverse, covariance), eyes(0.4))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from calib.geometry.covariance import moved_rig
 from calib.geometry.pointing import solve
 from calib.geometry.rig import AxisJoint, JointErrors, Rig
 from calib.geometry.stereo import triangulate
-from calib.plan.knowledge import CLICKS, BenchShot, Knowledge, Workspace, pointing
+from calib.plan.knowledge import CLICKS, RANGES_M, BenchShot, Knowledge, Workspace, pointing
 from calib.plan.placements import Placement, advise, first_placement
 from calib.plan.poses import (
     Sought,
@@ -54,7 +55,7 @@ def standing(rig: Rig, placement: Placement, name: str = "p1", joint_sigma_rad: 
 
 def test_pointing_rates_are_differences_between_rigs(rig: Rig) -> None:
     known = Knowledge(rig, {})
-    where = Workspace(PAIR, (-0.7, 0.7), (-0.5, 0.1), ranges_m=(3.0,))
+    where = Workspace(PAIR, (-0.7, 0.7), (-0.5, 0.1))
     aim = pointing(known, where)
     model = rig.cameras[PAIR[0]].model
     tried = 0
@@ -65,15 +66,13 @@ def test_pointing_rates_are_differences_between_rigs(rig: Rig) -> None:
             other = moved_rig(rig, [name], np.array([step]))
         except ValueError:
             continue
-        landed, row = [], 0
+        landed = []
         approach = 0
-        for pan in np.linspace(-0.7, 0.7, 5):
-            for tilt in np.linspace(-0.5, 0.1, 3):
-                for click in CLICKS:
-                    approach = 1 if approach != 1 else -1
-                    if tried % 7 == 0 or row % 5 == 0:
-                        landed.append((row, _landed(rig, other, (pan, tilt), approach, click)))
-                    row += 1
+        pans, tilts = np.linspace(-0.7, 0.7, 5), np.linspace(-0.5, 0.1, 3)
+        for row, (pan, tilt, range_m, click) in enumerate(product(pans, tilts, RANGES_M, CLICKS)):
+            approach = 1 if approach != 1 else -1
+            if row % (5 if tried % 7 == 0 else 17) == 0:
+                landed.append((row, _landed(rig, other, (pan, tilt), range_m, approach, click)))
         wanted = np.array([off for _, off in landed]) / step
         found = np.array([aim.to_rig[2 * r : 2 * r + 2, k] for r, _ in landed])
         size = max(np.abs(wanted).max(), 1.0)
@@ -83,7 +82,12 @@ def test_pointing_rates_are_differences_between_rigs(rig: Rig) -> None:
 
 
 def _landed(
-    true: Rig, believed: Rig, read: tuple[float, float], approach: int, click: tuple[float, float]
+    true: Rig,
+    believed: Rig,
+    read: tuple[float, float],
+    range_m: float,
+    approach: int,
+    click: tuple[float, float],
 ) -> np.ndarray:
     """Where the clicked point comes to lie, less the middle, if a rig that is none points at it."""
     sides = (approach, approach)
@@ -92,7 +96,7 @@ def _landed(
     here = true.joints.true_rad(read, sides)
     eyes = [true.camera_in_rover(name, *here) for name in PAIR]
     ray = eyes[0].ray(np.array([click[0] * width, click[1] * height]))
-    point = ray.origins_m + 3.0 * ray.directions
+    point = ray.origins_m + range_m * ray.directions
     pixels = [eye.project(point)[0] for eye in eyes]
     seen = [believed.camera_in_rover(name, *believed.joints.true_rad(read, sides)) for name in PAIR]
     ranged = triangulate(seen[0], seen[1], *pixels).position_m

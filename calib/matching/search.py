@@ -120,7 +120,7 @@ def pose_doubt(believed_m: FloatArray, covariance_m2: FloatArray, seen: OnePoint
 
 
 @dataclass(frozen=True, eq=False)
-class TrackLook:
+class TrackSearch:
     """The track after one search, and the match in each camera, by name.
 
     ``reason`` is why the target is lost, one sentence; empty while it is tracked. ``chi2`` is the weighted
@@ -137,26 +137,26 @@ class TrackLook:
     doubt: str = ""
 
 
-def seen_by(track: Track, images: Images, settings: TrackSettings | None = None) -> TrackLook:
+def seen_by(track: Track, images: Images, settings: TrackSettings | None = None) -> TrackSearch:
     """Search for the target in one or two new pictures of one moment, and update the track.
 
     The cameras are in the rover frame. One camera alone serves while the target is tracked.
     """
     settings = settings or TrackSettings()
-    look = _seen(track, images, settings)
-    if look.track.state == "lost" and track.standby is not None and images:
+    result = _seen(track, images, settings)
+    if result.track.state == "lost" and track.standby is not None and images:
         again = _seen(replace(track, key=track.standby, standby=None), images, settings)
-        look = replace(again, renewed=True) if again.track.state == "tracked" else look
-    if look.track.state == "lost" and not look.doubt and track.state == "tracked":
-        look = replace(look, doubt=_seen_elsewhere(track, images, settings))
-    return look
+        result = replace(again, renewed=True) if again.track.state == "tracked" else result
+    if result.track.state == "lost" and not result.doubt and track.state == "tracked":
+        result = replace(result, doubt=_seen_elsewhere(track, images, settings))
+    return result
 
 
 def _seen_elsewhere(track: Track, images: Images, settings: TrackSettings) -> str:
     """What a wider window shows of a target that is not where the motion since the last search put it.
 
     Both cameras must know the key picture well and mean one point. The target stays lost all the same: so far
-    off, the next rock may look like it.
+    off, the next rock may resemble it.
     """
     key = anchored(track)
     if key is None or len(images) < 2 or not track.motion_covariance.any():
@@ -175,7 +175,7 @@ def _pixels(good: Mapping[str, PatchMatch], images: Images) -> list[PixelSightin
     return [(images[name].camera, one.pixel_px, one.covariance_px2) for name, one in good.items()]
 
 
-def _seen(track: Track, images: Images, settings: TrackSettings) -> TrackLook:
+def _seen(track: Track, images: Images, settings: TrackSettings) -> TrackSearch:
     """Search by the track's key."""
     key = anchored(track)
     if key is None:
@@ -218,7 +218,7 @@ def _seen(track: Track, images: Images, settings: TrackSettings) -> TrackLook:
         return replace(_lost(track, found, reason), chi2=point.chi2, doubt=doubt)
     standby = None if renewed else fresh or (track.standby and carried(track.standby, turned))
     after = Track("tracked", point.position_m, point.covariance_m2, chosen, standby)
-    return TrackLook(after, found, "", point.chi2, renewed, doubt)
+    return TrackSearch(after, found, "", point.chi2, renewed, doubt)
 
 
 def _matched(
@@ -282,5 +282,5 @@ def _found(
     return match_patch(key.view, key.pixel_px, plane, image, search, SIZES)
 
 
-def _lost(track: Track, found: Mapping[str, PatchMatch], reason: str) -> TrackLook:
-    return TrackLook(replace(track, state="lost", misses=track.misses + 1), found, reason)
+def _lost(track: Track, found: Mapping[str, PatchMatch], reason: str) -> TrackSearch:
+    return TrackSearch(replace(track, state="lost", misses=track.misses + 1), found, reason)
