@@ -257,7 +257,6 @@ class Cameras:
         self._paired_s: dict[str, float] = {}  # per camera when the last frame that served a set began
         self._learned: dict[tuple[str, str], Offset] = {}
         self._still_since: dict[str, StampedFrame] = {}  # per camera the first frame of the same content
-        self._stamping = {name: threading.Lock() for name in self._cameras}
         self._watching = threading.Lock()
         self._watch_from_s = 0.0  # of real time
         self._threads.update({name: self._thread_of(name) for name in self._cameras})
@@ -579,12 +578,10 @@ class Cameras:
             tilt_approach=joints.approach[1],
             settings=frame.settings,
         )
-        with self._stamping[camera]:
-            self._check_alive(stamped)
-            return self._store.add(stamped, published)
+        return self._store.add(stamped, published, self._check_alive)
 
     def _check_alive(self, frame: StampedFrame) -> None:
-        """Refuse a head camera's image that did not change at all while the head moved."""
+        """Refuse a head camera's image that did not change at all while the head moved; the store calls it."""
         since = self._still_since.get(frame.camera)
         if since is None or not np.array_equal(since.image, frame.image):
             self._still_since[frame.camera] = frame

@@ -29,82 +29,6 @@ from mastctl.devices.keep_out import Pair
 from mastctl.devices.thread import AT_ONCE_S, PATIENCE_S, DeviceThread, StopRequests
 from mastctl.errors import MastctlError, Stopped
 
-ENDS_S = 1.0
-WATCH_S = 0.1  # a call is overdue by the clock alone; so late that may show
-
-
-class FaultWatch:
-    """Publishes what is wrong with each device or file, and informs the machine of the head's faults.
-
-    ``faults`` returns what is wrong with any device now; it must not wait, nor may what `also` gets. Each
-    change is published as ``("fault", device, tuple)``.
-    """
-
-    def __init__(
-        self, faults: Callable[[], Sequence[StandingFault]], head: str, machine: StateMachine, clock: Clock
-    ) -> None:
-        self._sources: tuple[Callable[[], Sequence[StandingFault]], ...] = (faults,)
-        self._head = head
-        self._machine = machine
-        self._published: dict[str, tuple[StandingFault, ...]] = {}
-        self._lock = threading.Lock()
-        self._changed = clock.signal()
-        self._begun = self._closed = False
-        self._thread = clock.thread(self._work, "faults")
-
-    def also(self, faults: Callable[[], Sequence[StandingFault]]) -> None:
-        """Watch another source from now on: the daemon's own files."""
-        self._sources = (*self._sources, faults)
-
-    def now(self) -> tuple[StandingFault, ...]:
-        """Return all that is wrong now, and publish what has changed."""
-        self.check()
-        return tuple(fault for faults in self._sources for fault in faults())
-
-    def begin(self) -> None:
-        """Watch from now on: ``faults`` can be called."""
-        self._begun = True
-        self._thread.start()
-
-    def check(self) -> None:
-        """Publish what has changed; a check that is under way is not waited for."""
-        if self._begun and self._lock.acquire(blocking=False):
-            try:
-                self._compare()
-            finally:
-                self._lock.release()
-
-    def close(self) -> None:
-        """Check once more, and end the thread."""
-        self.check()
-        with self._changed:
-            self._closed = True
-            self._changed.notify_all()
-        self._thread.join(ENDS_S)
-
-    def _work(self) -> None:
-        while True:
-            with self._changed:
-                if not self._closed:
-                    self._changed.wait(WATCH_S, idle=True)
-                if self._closed:
-                    return
-            self.check()
-
-    def _compare(self) -> None:
-        by_device: dict[str, list[StandingFault]] = {}
-        for fault in (one for faults in self._sources for one in faults()):
-            by_device.setdefault(fault.device, []).append(fault)
-        for device in {*self._published, *by_device}:
-            now = tuple(by_device.get(device, ()))
-            if same_faults(now, self._published.get(device, ())):
-                continue
-            self._published[device] = now
-            self._machine.publisher.publish("fault", device, now)
-            if device == self._head:
-                self._machine.head_faults(now)
-
-
 log = logging.getLogger(__name__)
 
 HEAD = "pan_tilt"
@@ -112,6 +36,7 @@ READ_TIMEOUT_S = 1.0
 MOVE_TIMEOUT_S = 1.0
 STOP_TIMEOUT_S = 1.0
 CLOSE_S = 2.0
+WATCH_S = 0.1  # a call is overdue by the clock alone; so late that may show
 MOVING_PERIOD_S = 0.02
 RESTING_PERIOD_S = 0.05
 FAULTS = {
@@ -192,7 +117,6 @@ class Devices(Cameras):
         super().__init__(
             hardware.cameras, store, history, self.read, HEAD, clock, deadlines, rig, camera_grace_s
         )
-        self.fault_watch = FaultWatch(self._faults, HEAD, self._machine, deadlines)
         self._head = DeviceThread(
             HEAD,
             between=self._poll,
@@ -203,7 +127,10 @@ class Devices(Cameras):
         )
         patience_s = AT_ONCE_S if self._pan_tilt.info.stops_beside is True else PATIENCE_S
         self._stops = StopRequests(self._head, HEAD, lambda: self._pan_tilt.stop(), deadlines, patience_s)
-        self.fault_watch.begin()
+        self._sources: tuple[Callable[[], Sequence[StandingFault]], ...] = (self._faults,)
+        self._published: dict[str, tuple[StandingFault, ...]] = {}  # faults by device
+        self._comparing = threading.Lock()
+        self._watch = DeviceThread("faults", between=self.check_faults, clock=deadlines)
 
     @property
     def last_reading(self) -> HeadReading | None:
@@ -216,17 +143,7 @@ class Devices(Cameras):
         Raises NoReply, BadReply, DriverError if the head does not answer in 1 s, both tries together, or
         answers what cannot be true. The error is that of the first try.
         """
-        until_s = self._time.now_s() + READ_TIMEOUT_S
-        try:
-            return self._head.call("read", self._read_once, READ_TIMEOUT_S)
-        except (NoReply, BadReply) as error:
-            left_s = until_s - self._time.now_s()
-            if left_s <= 0:
-                raise
-            try:
-                return self._head.call("read", self._read_once, left_s)
-            except DriverError:
-                raise error from None
+        return self._head.call("read", self._read_twice, READ_TIMEOUT_S)
 
     @property
     def temperatures_c(self) -> Mapping[str, float]:
@@ -286,7 +203,7 @@ class Devices(Cameras):
             check_free()
             self.judge.limits.check(*goal)
             speed = self.judge.limits.speed(speed_rad_per_s)
-            start = self.judge.check_move(goal, self._read_for_move)
+            start = self.judge.check_move(goal, self._read_twice)
             check_free()  # the head may have been read meanwhile
             self._history.move_sent(self._clock.now_s())
             self.judge.sent(start, goal, speed)
@@ -308,10 +225,10 @@ class Devices(Cameras):
             self._stops.send(STOP_TIMEOUT_S)
         except BaseException as error:
             self._stop_lost |= isinstance(error, LineLost)
-            self.fault_watch.check()  # the fault is published before the stop is over
+            self.check_faults()  # the fault is published before the stop is over
             raise
         if self._machine.standing.faults:
-            self.fault_watch.check()
+            self.check_faults()
 
     def stops_returned(self, timeout_s: float) -> bool:
         """Return whether every stop has come back from the driver within ``timeout_s`` seconds."""
@@ -343,10 +260,35 @@ class Devices(Cameras):
         self.judge.use_rig(rig)
         self._store.change_mast(mast_digest)
 
+    def watch_faults(self, source: Callable[[], Sequence[StandingFault]]) -> None:
+        """Have another source's faults published too: the daemon's own files. It must not wait."""
+        self._sources = (*self._sources, source)
+
     def faults(self) -> tuple[StandingFault, ...]:
-        """Return what is wrong with any device now, what the head reports about itself included."""
-        self.fault_watch.check()
-        return self._faults()
+        """Return all that is wrong now, as the head reports it too; publish what has changed."""
+        self.check_faults()
+        return tuple(fault for faults in self._sources for fault in faults())
+
+    def check_faults(self) -> float:
+        """Publish what has changed as ``("fault", device, tuple)``; the machine is informed of the head's.
+
+        A check that is under way is not waited for. Returns when to check again, seconds.
+        """
+        if self._comparing.acquire(blocking=False):
+            try:
+                by_device: dict[str, list[StandingFault]] = {}
+                for fault in (one for faults in self._sources for one in faults()):
+                    by_device.setdefault(fault.device, []).append(fault)
+                for device in {*self._published, *by_device}:
+                    now = tuple(by_device.get(device, ()))
+                    if not same_faults(now, self._published.get(device, ())):
+                        self._published[device] = now
+                        self._publisher.publish("fault", device, now)
+                        if device == HEAD:
+                            self._machine.head_faults(now)
+            finally:
+                self._comparing.release()
+        return WATCH_S
 
     def _faults(self) -> tuple[StandingFault, ...]:
         reported = [
@@ -375,15 +317,19 @@ class Devices(Cameras):
         until_s = self._time.now_s() + CLOSE_S
         self._head.close(CLOSE_S)
         self.close_cameras(until_s)
-        self.fault_watch.close()
+        self.check_faults()
+        self._watch.close(CLOSE_S)
 
     # In the head's own thread
 
-    def _read_for_move(self) -> HeadReading:
+    def _read_twice(self) -> HeadReading:
         try:
             return self._read_once()
-        except (NoReply, BadReply):
-            return self._read_once()  # one answer lost on the line moves nothing and stops nothing
+        except (NoReply, BadReply) as error:  # one answer lost on the line moves nothing and stops nothing
+            try:
+                return self._read_once()
+            except DriverError:
+                raise error from None
 
     def _read_once(self) -> HeadReading:
         answer = self._pan_tilt.read()

@@ -249,12 +249,18 @@ class FrameStore:
             self._newest = {name: frame for name, frame in self._newest.items() if name != camera}
             self._runs[camera] = self._new_run()
 
-    def add(self, frame: StampedFrame, published: bool = True) -> StampedFrame:
-        """Keep a frame and return it, or the one of that id that is kept already.
+    def add(
+        self,
+        frame: StampedFrame,
+        published: bool = True,
+        check: Callable[[StampedFrame], None] = lambda frame: None,
+    ) -> StampedFrame:
+        """Keep a frame that passes a ``check`` and return it, or the one of that id that is kept already.
 
         One that is only watched is not ``published``, and so not recorded.
         """
         with self._lock:
+            check(frame)
             if frame.mast_digest == self._digest:  # else the mast file changed while it was on its way
                 frames = self._frames.setdefault(frame.camera, deque(maxlen=KEPT_FRAMES))
                 known = next((one for one in frames if one.frame_id == frame.frame_id), None)

@@ -13,7 +13,7 @@ import threading
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from itertools import islice, pairwise
+from itertools import islice, pairwise, takewhile
 
 import numpy as np
 
@@ -208,19 +208,14 @@ class JointHistory:
 
     def _dithers(self, until_s: float) -> bool:
         """Whether the readings up to a moment are those of a head that dithers at rest; the lock is kept."""
-        return any(self._dithers_for(for_s, until_s) for for_s in (DITHER_S, 2 * DITHER_S))
-
-    def _dithers_for(self, for_s: float, until_s: float) -> bool:
-        since_s = until_s - for_s
-        if any(since_s <= sent_s <= until_s for sent_s in self._moves_s):
-            return False
-        window: list[Reading] = []
-        for reading in reversed(self._readings):
-            if reading.time_s < since_s:
-                break
-            if reading.time_s <= until_s:
-                window.append(reading)
-        return bool(window) and dithers(window[::-1], for_s=for_s)
+        for for_s in (DITHER_S, 2 * DITHER_S):
+            if any(until_s - for_s <= sent_s <= until_s for sent_s in self._moves_s):
+                continue
+            late = takewhile(lambda one: one.time_s >= until_s - for_s, reversed(self._readings))  # noqa: B023
+            window = [one for one in late if one.time_s <= until_s]
+            if window and dithers(window[::-1], for_s=for_s):
+                return True
+        return False
 
 
 def _taken_along(load: Interval | None, read_rad: float, play_rad: float) -> Interval:

@@ -410,13 +410,10 @@ class StopRequests:
         Raises NoReply if no stop was confirmed within ``timeout_s`` seconds; the head may still move;
         DriverError, MastctlError if the driver refused it.
         """
-        with self._clock.at_work():  # a simulation's second does not pass before the stop is queued
-            self._confirmed(timeout_s)
-
-    def _confirmed(self, timeout_s: float) -> None:
         requested_s = self._clock.now_s()
         try:
-            self._send(requested_s, timeout_s)
+            with self._clock.at_work():  # a simulation's second does not pass before the stop is queued
+                self._send(requested_s, timeout_s)
         except (DriverError, MastctlError) as error:
             message = str(error) if MAY_MOVE in str(error) else f"{error}; {MAY_MOVE}"
             with self._changed:

@@ -140,7 +140,7 @@ class Service:
             publisher,
             lambda: self.devices.temperatures_c,
         )
-        self.devices.fault_watch.also(self._own_faults)
+        self.devices.watch_faults(self._own_faults)
         self.stop_socket: StopSocket | None = None
         self._socket_folder: StateFolder | None = None
         self.manager = ServiceManager({})
@@ -228,7 +228,7 @@ class Service:
     def status(self) -> Status:
         """Return what is known at this moment, as ``GET /status`` has it."""
         now_s = self.clock.now_s()
-        faults = self.devices.fault_watch.now()  # first: the machine hears of them
+        faults = self.devices.faults()  # first: the machine hears of them
         former, reading, track = self.masts.former, self.devices.last_reading, self.tracker.status
         return {
             **self.machine.standing.summary(now_s),
