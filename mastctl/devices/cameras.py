@@ -581,7 +581,7 @@ class Cameras:
         return self._store.add(stamped, published, self._check_alive)
 
     def _check_alive(self, frame: StampedFrame) -> None:
-        """Refuse a head camera's image that did not change at all while the head moved; the store calls it."""
+        """Refuse a head camera's image that did not change at all while the head moved."""
         since = self._still_since.get(frame.camera)
         if since is None or not np.array_equal(since.image, frame.image):
             self._still_since[frame.camera] = frame

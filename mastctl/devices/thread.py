@@ -410,9 +410,9 @@ class StopRequests:
         Raises NoReply if no stop was confirmed within ``timeout_s`` seconds; the head may still move;
         DriverError, MastctlError if the driver refused it.
         """
-        requested_s = self._clock.now_s()
         try:
             with self._clock.at_work():  # a simulation's second does not pass before the stop is queued
+                requested_s = self._clock.now_s()
                 self._send(requested_s, timeout_s)
         except (DriverError, MastctlError) as error:
             message = str(error) if MAY_MOVE in str(error) else f"{error}; {MAY_MOVE}"
