@@ -23,6 +23,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from anyio import CancelScope, CapacityLimiter, move_on_after
@@ -194,35 +195,50 @@ SILENT_S = 20.0  # twice as long as the server keeps a connection for its next r
 SWEEP_S = 1.0
 
 
-class SilentConnections:
-    """The connections whose client has to send: no request has come, or no whole one.
+@dataclass(eq=False)
+class _Connection:
+    """A client's connection: when its client last sent, its whole requests under way, whether one ended."""
 
-    There may be ``most``, by default a quarter of the process' descriptors. ``now_s`` is real time, since
-    clients do not live in simulated time.
+    socket: socket.socket
+    since_s: float
+    requests: int = 0
+    served: bool = False
+
+    @property
+    def is_closed(self) -> bool:
+        return self.socket.fileno() < 0
+
+    @property
+    def has_bytes(self) -> bool:
+        """Whether its next request, or a part of one, waits to be read."""
+        try:
+            return bool(self.socket.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT))
+        except OSError:
+            return False
+
+
+class SilentConnections:
+    """The connections of a daemon, and which of them wait for their client: without a whole request.
+
+    ``most`` may wait, by default a quarter of the process' descriptors; those beyond are closed, those that
+    never had a whole request first. ``now_s`` is real time, since clients do not live in simulated time.
     """
 
     def __init__(self, most: int | None = None, now_s: Callable[[], float] = time.monotonic) -> None:
         self._most = most
         self._now_s = now_s
-        self._since: dict[tuple[Any, ...], tuple[socket.socket, float]] = {}  # by client, the oldest first
+        self._by_client: dict[tuple[Any, ...], _Connection] = {}
 
     def add(self, connection: socket.socket, client: tuple[Any, ...]) -> None:
-        """Note a connection that waits for its client; the oldest is closed if these are too many.
-
-        ``client`` is the host and port of the client, as ASGI states them.
-        """
-        self._since[client] = (connection, self._now_s())
-        most = self._most or max(resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4, 1)
-        if len(self._since) > most:
-            self.close_old()
-        if len(self._since) > most:
-            self._close(next(iter(self._since)))
+        """Note a new connection; ``client`` is the host and port of the client, as ASGI states them."""
+        self._by_client[client] = _Connection(connection, self._now_s())
+        self._bound()
 
     def close_old(self) -> None:
         """Close connections on which nothing came for ``SILENT_S``; forget those that have ended."""
         latest_s = self._now_s() - SILENT_S
-        for client, (connection, since_s) in list(self._since.items()):
-            if since_s <= latest_s or connection.fileno() < 0:
+        for client, one in list(self._by_client.items()):
+            if one.is_closed or (not one.requests and one.since_s <= latest_s and not one.has_bytes):
                 self._close(client)
 
     async def watch(self) -> None:
@@ -235,38 +251,59 @@ class SilentConnections:
         """Return an application that notes which connections have a whole request."""
 
         async def noted(scope: Scope, receive: Receive, send: Send) -> None:
-            client = tuple(scope.get("client") or ())
-            connection, _ = self._since.pop(client, (None, 0.0))
-            whole = connection is None or scope["type"] != "http"
+            one = self._by_client.get(tuple(scope.get("client") or ()))
+            if one is None:  # of a Unix socket
+                await app(scope, receive, send)
+                return
+            whole = scope["type"] != "http"
 
             async def part() -> Message:
                 nonlocal whole
-                if whole or connection is None:
+                if whole:
                     return await receive()
-                self.add(connection, client)
+                self._waits(one)
                 try:
                     message = await receive()
                 finally:
-                    self._since.pop(client, None)
+                    one.requests += 1
                 whole = not message.get("more_body", False)
                 return message
 
+            one.requests += 1
             try:
                 await app(scope, part, send)
             finally:
-                if connection is not None and connection.fileno() >= 0:
-                    self.add(connection, client)
+                one.served = True
+                self._waits(one)
 
         return noted
 
+    def _waits(self, one: _Connection) -> None:
+        one.requests -= 1
+        one.since_s = self._now_s()
+        self._bound()
+
+    def _bound(self) -> None:
+        """Close one connection that waits for its client if these are too many."""
+        most = self._most or max(resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4, 1)
+        if len(self._by_client) <= most:
+            return
+        self.close_old()
+        silent = {client: one for client, one in self._by_client.items() if not one.requests}
+        if len(silent) > most:
+            for client in sorted(silent, key=lambda client: (silent[client].served, silent[client].since_s)):
+                if not silent[client].has_bytes:
+                    self._close(client)
+                    return
+
     def _close(self, client: tuple[Any, ...]) -> None:
-        connection, _ = self._since.pop(client)
+        one = self._by_client.pop(client)
         with contextlib.suppress(OSError):  # closed already
-            connection.shutdown(socket.SHUT_RDWR)
+            one.socket.shutdown(socket.SHUT_RDWR)
 
 
 class Listener(socket.socket):
-    """A listening TCP socket that notes each connection as silent."""
+    """A listening TCP socket that notes each connection."""
 
     silent: SilentConnections | None = None
 

@@ -64,11 +64,56 @@ def test_a_whole_request_keeps_its_connection_and_its_end_begins_the_time_anew(
     assert not is_open(pair[1])
 
 
-def test_of_too_many_the_oldest_is_closed(pair: tuple[socket.socket, socket.socket]) -> None:
-    silent = SilentConnections(most=1)
+def test_a_request_that_begins_before_the_one_before_has_returned_is_under_way(
+    pair: tuple[socket.socket, socket.socket],
+) -> None:
+    now_s = 0.0
+    silent = SilentConnections(now_s=lambda: now_s)
     silent.add(pair[0], ("a", 1))
-    silent.add(pair[1], ("a", 2))
-    assert not is_open(pair[1])
+    scope: Any = {"type": "http", "client": ("a", 1)}
+
+    async def both() -> None:
+        answered, over = asyncio.Event(), asyncio.Event()
+
+        async def first(*_: Any) -> None:
+            await answered.wait()
+
+        async def second(*_: Any) -> None:
+            await over.wait()
+
+        stream: Any = None
+        former = asyncio.ensure_future(silent.around(first)(scope, stream, stream))
+        await asyncio.sleep(0)
+        later = asyncio.ensure_future(silent.around(second)(scope, stream, stream))
+        answered.set()
+        await former
+        nonlocal now_s
+        now_s = 2 * SILENT_S
+        silent.close_old()
+        assert is_open(pair[1])
+        over.set()
+        await later
+
+    asyncio.run(both())
+
+
+@pytest.mark.parametrize(("kind", "stays"), [("new", False), ("served", True), ("next request", True)])
+def test_of_too_many_those_without_any_request_are_closed_first(kind: str, stays: bool) -> None:
+    async def app(*_: Any) -> None:
+        pass
+
+    silent = SilentConnections(most=1)
+    with contextlib.ExitStack() as stack:
+        ends = [stack.enter_context(one) for _ in range(2) for one in socket.socketpair()]
+        for end in ends:
+            end.setblocking(False)
+        silent.add(ends[0], ("a", 1))
+        if kind == "served":
+            asyncio.run(silent.around(app)({"type": "http", "client": ("a", 1)}, None, None))  # type: ignore[arg-type]
+        if kind == "next request":
+            ends[1].send(b"GET")
+        silent.add(ends[2], ("a", 2))
+        assert (is_open(ends[1]), is_open(ends[3])) == (stays, not stays)
 
 
 @pytest.mark.parametrize(
