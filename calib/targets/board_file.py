@@ -239,12 +239,11 @@ def save_board(
     board: AnyBoard,
     bar_m: tuple[float, float] | None = None,
     name: str = "",
-    measured_m: tuple[float, float | None] | None = None,
 ) -> None:
     """Write a BOARD.yaml atomically, after it was read as it will be.
 
-    ``board`` is as drawn, ``bar_m`` and ``measured_m`` are the bars' lengths, across and down, as drawn and
-    on the print. Raises BadFile if a bar cannot have been measured so, or the file system refuses.
+    ``board`` is as drawn, ``bar_m`` are the bars' lengths, across and down. Raises BadFile if the file system
+    refuses.
     """
     document: dict[str, Any] = {"schema": SCHEMA}
     if name:
@@ -252,8 +251,6 @@ def save_board(
     document |= document_of(board)
     if bar_m is not None:
         document["bar_m"] = {"across": bar_m[0], "down": bar_m[1]}
-    if measured_m is not None:
-        document["measured"] = _measured(*measured_m)
     _save(path, document)
 
 
@@ -264,19 +261,10 @@ def measure(path: str | Path, across_m: float, down_m: float | None = None) -> t
     """
     data = read_bytes(path, MAX_BYTES)
     parse_board(data, path)
-    document = parse_mapping(data, path) | {"measured": _measured(across_m, down_m)}
+    measured = {"across_m": across_m} | ({} if down_m is None else {"down_m": down_m})
+    document = parse_mapping(data, path) | {"measured": measured}
     _save(path, document)
     return document["bar_m"]["across"], document["bar_m"]["down"]
-
-
-def bars_of(path: str | Path) -> tuple[float, float] | None:
-    """Return the lengths of a BOARD.yaml's bars as drawn, across and down, metres; None if it has none."""
-    bars = parse_record(BoardFileRecord, read_bytes(path, MAX_BYTES), path, SCHEMA).root.bar_m
-    return (bars.across, bars.down) if bars else None
-
-
-def _measured(across_m: float, down_m: float | None) -> dict[str, float]:
-    return {"across_m": across_m} | ({} if down_m is None else {"down_m": down_m})
 
 
 def _save(path: str | Path, document: dict[str, Any]) -> None:

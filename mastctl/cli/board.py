@@ -43,7 +43,6 @@ OPTIONS_OF = {
     option("--dictionary NAME", "of charuco, OpenCV's name; 5x5 as large as is needed, if left out"),
     option("--family NAME", "of aprilgrid: tag36h11 (default), tag25h9, tag16h5"),
     option("--first-id N", "number of the first marker; a second board's differ", type=int),
-    option("--measured-bar-mm MM...", "the bars of the print: across, down"),
     help="draw a board to print, and write its BOARD.yaml beside it",
     example="--kind charuco --paper A4 --out board.pdf",
 )
@@ -58,11 +57,10 @@ def _make(args: argparse.Namespace) -> Answer:
     paper_mm = _paper_mm(args)
     board = _board(args, paper_mm)
     sheet = sheet_of(board, paper_mm, out.stem)
-    measured = _bars_m(args.measured_bar_mm, sheet.bar_m, ("--measured-bar-mm", "--measured-bar-mm"))
     yaml = out.with_suffix(".yaml")
-    _check_free(yaml, measured is not None)
+    _check_free(yaml)
     save_bytes(out, pdf_of(sheet) if out.suffix == ".pdf" else svg_of(sheet))
-    save_board(yaml, board, sheet.bar_m, out.stem, measured)
+    save_board(yaml, board, sheet.bar_m, out.stem)
     return _written(yaml, [out, yaml, name_schema(yaml, "board")], sheet.bar_m)
 
 
@@ -75,13 +73,11 @@ def _make(args: argparse.Namespace) -> Answer:
     example="board.yaml --across-mm 149.6 --down-mm 149.8",
 )
 def _measured(args: argparse.Namespace) -> Answer:
-    from calib.targets.board_file import bars_of, measure
+    from calib.targets.board_file import measure
 
-    board = args.board
-    bars_mm = [one for one in (args.across_mm, args.down_mm) if one is not None]
-    across_m, down_m = _bars_m(bars_mm, bars_of(board), ("--across-mm", "--down-mm")) or (0.0, None)
+    board, down_mm = args.board, args.down_mm
     named = board.is_file() and board.read_bytes().startswith(NAMES_SCHEMA.encode())
-    bar_m = measure(board, across_m, down_m)
+    bar_m = measure(board, args.across_mm / 1000, None if down_mm is None else down_mm / 1000)
     if named:
         name_schema(board, "board")
     return _written(board, [board], bar_m)
@@ -128,12 +124,7 @@ def _find(args: argparse.Namespace) -> Answer:
             rows.append(f"{readable(name)},{number},{x!r},{y!r},{sigma!r}\n")
     if args.out is not None:
         save_bytes(args.out, "".join(rows).encode())
-    lines = [
-        f"{one['picture']}: {one['corners']} of {one['of']} corners, "
-        + (f"sigma {one['sigma_px']:.3f} px" if one["corners"] else str(one["reason"]))
-        for one in found
-    ]
-    return Answer({"pictures": found}, lines, 0 if any(one["corners"] for one in found) else 1)
+    return Answer({"pictures": found}, code=0 if any(one["corners"] for one in found) else 1)
 
 
 def _paper_mm(args: argparse.Namespace) -> tuple[float, float]:
@@ -206,50 +197,18 @@ def _refuse_others(args: argparse.Namespace) -> None:
             raise WrongUse(f"{given}: {value:g} where more than 0 and at most 1000 is expected")
 
 
-def _bars_m(
-    bars_mm: list[float] | None, drawn_m: tuple[float, float] | None, options: tuple[str, str]
-) -> tuple[float, float | None] | None:
-    """The measured bars, if they can be those that were drawn. Raises WrongUse, in millimetres."""
-    from calib.targets.board_file import WORST_ASPECT, WORST_SCALE
-
-    if not bars_mm:
-        return None
-    if len(bars_mm) > 2:
-        raise WrongUse(
-            f"--measured-bar-mm: {len(bars_mm)} numbers where one or two are expected: across, down"
-        )
-    scale = 1.0
-    for name, bar_mm, bar_m, part in zip(
-        options, bars_mm, drawn_m or (), (WORST_SCALE, WORST_ASPECT), strict=False
-    ):
-        wanted_mm = 1000 * bar_m * scale
-        if not wanted_mm * (1 - part) <= bar_mm <= wanted_mm * (1 + part):
-            metres = f"; {bar_mm:g} m is {1000 * bar_mm:g} mm" if abs(bar_mm) < 10 else ""
-            raise WrongUse(
-                f"{name} is {bar_mm:g} where {wanted_mm * (1 - part):.4g} to {wanted_mm * (1 + part):.4g} "
-                f"millimetres are expected, {1000 * bar_m:.4g} as drawn{metres}"
-            )
-        scale *= bar_mm / wanted_mm
-    return bars_mm[0] / 1000, bars_mm[1] / 1000 if len(bars_mm) > 1 else None
-
-
-def _check_free(yaml: Path, measured: bool) -> None:
+def _check_free(yaml: Path) -> None:
     """Refuse to write over a board that has been measured."""
     from calib.errors import BadFile
     from calib.files import read_bytes
     from calib.files.yaml_text import MAX_BYTES, parse_mapping
 
-    if measured or not yaml.exists():
-        return
     try:
-        present = parse_mapping(read_bytes(yaml, MAX_BYTES), yaml)
+        measured = yaml.exists() and "measured" in parse_mapping(read_bytes(yaml, MAX_BYTES), yaml)
     except BadFile:
         return
-    if "measured" in present:
-        raise WrongUse(
-            f"{yaml} has a measured board; another name for --out, or the bars again (--measured-bar-mm), "
-            "is expected"
-        )
+    if measured:
+        raise WrongUse(f"{yaml} has a measured board; another name for --out is expected")
 
 
 def _written(yaml: Path, files: list[Path], bar_m: tuple[float, float]) -> Answer:
