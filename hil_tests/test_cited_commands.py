@@ -74,7 +74,7 @@ def options_of(module: str) -> frozenset[str]:
     if not file.is_file():
         return frozenset()
     texts = [file.read_text(encoding="utf-8"), (REPOSITORY / "tools/command.py").read_text(encoding="utf-8")]
-    texts.append((REPOSITORY / "mastctl/cli/tasks.py").read_text(encoding="utf-8"))
+    texts.append((REPOSITORY / "mastctl/cli/experiment.py").read_text(encoding="utf-8"))
     texts += [one.read_text(encoding="utf-8") for one in file.parent.glob("*.py")]
     return frozenset(re.findall(r'"(--[a-z][\w-]*)[" ]', "\n".join(texts)))
 

@@ -21,9 +21,9 @@ from numpy.typing import ArrayLike
 from calib.errors import CalibError
 from drivers.errors import DriverError
 from mastctl import signals
+from mastctl.cli.experiment import TASKS
 from mastctl.cli.options import add_options, at_least
 from mastctl.cli.output import CommandError, WrongUse, as_command_error, one_line
-from mastctl.cli.tasks import TASKS
 from mastctl.errors import MastctlError
 
 Task = TypeVar("Task")

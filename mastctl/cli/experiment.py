@@ -8,21 +8,24 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, NoReturn, TypeVar
 
 import mastctl
 from mastctl.cli import output
 from mastctl.cli.daemon import DAEMON, client_of
-from mastctl.cli.options import command, option
+from mastctl.cli.options import Group, command, option
 from mastctl.cli.output import Answer, Shown, WrongUse, check_folder
-from mastctl.cli.rig import HEADS
-from mastctl.cli.tasks import TASKS, check_place, results_of, run_bar
+from mastctl.cli.rig import HEADS, SPEED, WIRE
 
 if TYPE_CHECKING:
     from mastctl.client import Client
     from mastctl.experiment.pointing import ClickTruth, PointingExperiment, TargetRecord
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
 
 DEFAULT_DISTANCES_M = (10.0, 6.0, 2.0)
 STUDIES = {
@@ -33,15 +36,15 @@ STUDIES = {
 """Experiments that are ``tools.studies.NAME`` in a checkout; their own ``--help`` has their options."""
 
 
+TASKS = Group(
+    (
+        option("--executor WHERE", "local: this machine's processes; dask:ADDRESS", default="local"),
+        option("--workers N", "local processes (default: one a processor)"),
+    ),
+    title="tasks",
+    about="where they run (docs/how-to/simulation.md)",
+)
 SEED = option("--seed SEED", "chooses views and pixels", default=1)
-
-
-def _speed(text: str) -> float | str:
-    """Read a number; the configuration judges any other text (argparse ``type``)."""
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 def study_of(words: Sequence[str]) -> tuple[str, list[str]] | None:
@@ -140,14 +143,8 @@ def _run_simulated(args: argparse.Namespace) -> Answer:
         "a simulated rig of one's own, with its own seed; --seed then chooses views and pixels only",
     ),
     option(f"--head {HEADS}", "simulated head (default ptu_d46_70, or that of --wire)"),
-    option(
-        "--wire DRIVER", "drive the head through this real driver and a byte simulator (default: in memory)"
-    ),
-    option(
-        "--speed N",
-        "1: the rover takes its time; 10: a tenth of it; max: nothing waits (default)",
-        type=_speed,
-    ),
+    WIRE,
+    SPEED,
     example="--out demo",
 )
 def run_demo(args: argparse.Namespace) -> Answer:
@@ -235,3 +232,62 @@ def _report(args: argparse.Namespace, experiment: PointingExperiment) -> Answer:
     )
     document = experiment.as_json() | ({} if page is None else {"report": str(page)})
     return Answer(document, shown, 0 if any(record.landings for record in experiment.records) else 1)
+
+
+def check_place(args: argparse.Namespace) -> None:
+    """Refuse options of a running daemon beside --simulated, and of tasks without it. Raises WrongUse."""
+    if args.simulated:
+        for name in ("url", "config", "lease"):
+            if getattr(args, name) is not None:
+                raise WrongUse(f"--{name} names a running daemon; --simulated starts rovers of its own")
+        return
+    for name, usual in (("executor", "local"), ("workers", None)):
+        if getattr(args, name) != usual:
+            raise WrongUse(
+                f"--{name} belongs to --simulated, which runs simulated rovers of its own; a running daemon "
+                "is one mast, and its targets come one after another"
+            )
+
+
+def results_of(
+    args: argparse.Namespace,
+    name: str,
+    function: Callable[[Task], Result],
+    tasks: Sequence[Task],
+    label: Callable[[Task], str] = str,
+    failure: Callable[[Result], str] = lambda _: "",
+    found: Callable[[Result], str] = lambda _: "",
+) -> list[Result]:
+    """Run a command's tasks as its options say, with a progress bar of this ``name`` on stderr.
+
+    ``failure`` returns why a result is a failure, ``found`` a line for one that is none; either is shown as
+    it comes, unless it is empty. The rest as `mastctl.experiment.tasks.run_tasks`.
+    """
+    from mastctl.experiment.tasks import open_executor, run_tasks
+
+    def ended(task: Task, result: Result) -> None:
+        reason, line = failure(result), found(result)
+        step("", reason and f"{label(task)}: {reason}", line and f"{label(task)}: {line}")
+
+    with run_bar(args, name, len(tasks)) as step, open_executor(args.executor, args.workers) as executor:
+        return run_tasks(executor, function, tasks, label, ended)
+
+
+@contextmanager
+def run_bar(args: argparse.Namespace, name: str, total: int | None) -> Iterator[Callable[..., None]]:
+    """Show on stderr how far a run is.
+
+    It yields a function that is called after each part with what is done now (empty: as before), why the
+    part failed (empty: it did not), and what it found if that is worth a line.
+    """
+    with output.progress_bar(getattr(args, "json", False)) as progress:  # tools have no --json
+        task = progress.add_task(name, total=total)
+
+        def step(doing: str, failure: str, found: str = "") -> None:
+            if failure:
+                progress.console.print(failure, style="red", markup=False)
+            elif found:
+                progress.console.print(found, markup=False, highlight=False)
+            progress.update(task, advance=1, description=doing or None)
+
+        yield step

@@ -231,7 +231,7 @@ def _run(words: Sequence[str]) -> int:
         if words and words[0].startswith("--print-completion"):
             parser = _completing()
         else:
-            words, command = _ordered(words)
+            words, command = _joined(words)
             if command == "experiment":
                 from mastctl.cli.experiment import become_study, study_of
 
@@ -246,30 +246,21 @@ def _run(words: Sequence[str]) -> int:
     return output.show(args, answer) if isinstance(answer, output.Answer) else int(answer)
 
 
-def _ordered(words: Sequence[str]) -> tuple[list[str], str]:
-    """Return the words with a leading --url last and a command of two words as one, and the command.
+def _joined(words: Sequence[str]) -> tuple[list[str], str]:
+    """Return the words with a command of two words as one, and the command.
 
     Raises WrongUse for an unknown command, with the nearest known one; argparse would list them all.
     """
-    options: list[str] = []
-    url: list[str] = []
-    rest = list(words)
-    while rest and rest[0].startswith("-"):
-        place, size = (url, 2 if rest[0] == "--url" else 1) if rest[0].startswith("--url") else (options, 1)
-        place += rest[:size]
-        rest = rest[size:]
-    if not rest:
-        return options, ""
-    if len([word for word in (*url, *rest) if word == "--url" or word.startswith("--url=")]) > 1:
-        raise output.WrongUse("--url is there twice; one address is expected")
-    command = rest.pop(0)
+    if not words or words[0].startswith("-"):
+        return list(words), ""
+    command, *rest = words
     if command not in COMMANDS:
         near = get_close_matches(command, COMMANDS, n=1)
         hint = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(COMMANDS)}"
         raise output.WrongUse(f"no command '{command}'; {_moved(command) or hint}")
     if rest and f"{command} {rest[0]}" in COMMANDS:  # a folder of that name is ``./bench``
         command = f"{command} {rest.pop(0)}"
-    return [*options, command, *rest, *url], command
+    return [command, *rest], command
 
 
 def _moved(command: str) -> str:

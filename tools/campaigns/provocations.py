@@ -59,8 +59,8 @@ from hil_tests.support.sim_survey.plan import SurveyPlan, rover_from_head
 from mastctl.bench.mast import BOARD
 from mastctl.calibration.run import SurveyRefused, checked_survey
 from mastctl.calibration.verdict import judge
+from mastctl.cli.experiment import results_of
 from mastctl.cli.main import main as mastctl
-from mastctl.cli.tasks import results_of
 from mastctl.client import Client, Snapshot
 from mastctl.config import Listen, load_config
 from mastctl.daemon import RunningDaemon

@@ -24,8 +24,8 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid, moved_rigid
 from calib.matching.handoff import MatchedHandoff, RefinedPixel, matched_handoff
 from mastctl.calibration.landing import handoff_errors_px
+from mastctl.cli.experiment import results_of
 from mastctl.cli.options import at_least, not_negative, positive_number
-from mastctl.cli.tasks import results_of
 from tools.command import end, options, rms, show
 
 HEAD_HEIGHT_M, ASIDE_RAD = 1.45, 0.35

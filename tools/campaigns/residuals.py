@@ -27,7 +27,7 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
 from drivers.sim.rover import RoverModel
 from drivers.simulation_clock import MAX
-from mastctl.cli.tasks import results_of
+from mastctl.cli.experiment import results_of
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon

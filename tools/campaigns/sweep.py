@@ -23,7 +23,7 @@ import numpy as np
 import yaml
 
 from drivers.simulation_clock import MAX
-from mastctl.cli.tasks import results_of
+from mastctl.cli.experiment import results_of
 from mastctl.client import Client
 from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon

@@ -34,7 +34,7 @@ from hil_tests.support.sim_survey.plan import SurveyPlan
 from hil_tests.support.sim_survey.survey import simulate_survey
 from mastctl.calibration.run import SurveyRefused, checked_survey
 from mastctl.calibration.verdict import judge
-from mastctl.cli.tasks import results_of
+from mastctl.cli.experiment import results_of
 from tools.campaigns.coverage import pixel_errors, plan_of
 from tools.campaigns.provocations import PAIRS, RIG, errors_in_sigmas, rig_of_pairs
 from tools.campaigns.provoked import Provoked

@@ -28,7 +28,7 @@ from calib.matching.search import seen_by
 from calib.matching.track import Track, moved_track, start_track
 from drivers.sim.placed import SceneSettings
 from drivers.sim.scene import build_scene
-from mastctl.cli.tasks import results_of
+from mastctl.cli.experiment import results_of
 from mastctl.experiment.targets import texture_mask
 from mastctl.motion.search import choose_pairs
 from mastctl.packaged import config_folder

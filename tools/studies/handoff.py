@@ -21,9 +21,9 @@ from calib.files.mast_file import load_rig
 from calib.matching.handoff import handoff_bias
 from mastctl.cli import output
 from mastctl.cli.daemon import DAEMON, client_of
+from mastctl.cli.experiment import check_place, results_of, run_bar
 from mastctl.cli.options import add_options, at_least
 from mastctl.cli.output import check_folder
-from mastctl.cli.tasks import check_place, results_of, run_bar
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.experiment.simulated import Rover, running_rover, simulation_truth
