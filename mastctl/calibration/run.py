@@ -9,11 +9,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from calib.adjust.result import BenchCalibration, Calibration
+from calib.adjust.terms import ImageTerm, image_terms
+from calib.calibrate.bench import bench_terms
+from calib.calibrate.families import FOLDS, compare_families, earned
 from calib.calibrate.paper import fit_paper
 from calib.calibrate.survey import fit_joint
 from calib.errors import BadFile, CalibError
 from calib.files.mast_file import StoredRig
 from calib.geometry.rig import Rig
+from calib.geometry.rigid import Rigid
 from calib.survey.check import check_survey
 from calib.survey.find_dots import Progress, detect_survey
 from calib.survey.records import Survey, SurveyFinding
@@ -146,6 +150,47 @@ def conclude(
         return saved, previous, write_report(report, survey, fit, verdict, saved, former, **own)
     except (OSError, BadFile) as error:
         raise NotReported(f"the mast file {saved.path} is saved, but its report is not: {error}") from None
+
+
+def compared_models(survey: Survey) -> dict[str, Any]:
+    """Return for each camera the model that it earns, with a sentence, and how well each predicts.
+
+    That is by pictures left out of a fit; a camera of fewer than five images with points has none.
+    """
+    terms: Sequence[ImageTerm]
+    if survey.boards:
+        terms = bench_terms(survey, [])[0]
+    else:
+        anywhere = {(image.setup, image.placement): Rigid.identity() for image in survey.images}
+        terms = image_terms(survey, anywhere, [])[0]
+    found = {}
+    for name, camera in survey.cameras.items():
+        mine, fitted = [term for term in terms if term.camera == name], camera.kind
+        scores = compare_families(mine, camera.size_px, camera.focal_px) if len(mine) >= FOLDS else ()
+        if not scores:
+            continue
+        best = earned(scores, fitted)
+        off_px = {one.kind: f"{one.left_out_px:.3f}" for one in scores}
+        if best.kind == fitted:
+            sentence = (
+                f"{fitted} is right: no other model predicts left-out pictures better than chance explains"
+            )
+        else:
+            before = f"{off_px[fitted]} px" if fitted in off_px else "no prediction"
+            sentence = (
+                f"{best.kind} predicts left-out pictures to {off_px[best.kind]} px, {fitted} to {before}: "
+                f"fit again with --model {best.kind.lower()}"
+            )
+        found[name] = {
+            "fitted": fitted,
+            "proposed": best.kind,
+            "sentence": f"{sentence} (px: {', '.join(map(' '.join, off_px.items()))})",
+            "models": [
+                {"model": one.kind, "parameters": one.parameters, "left_out_px": one.left_out_px}
+                for one in scores
+            ],
+        }
+    return found
 
 
 def sentence_of(finding: SurveyFinding) -> str:

@@ -40,11 +40,6 @@ TURNED_RAD = 2.0
 PAPER_GOOD_PX = 2.0
 """Rms of fitted images that the paper's method may leave: station errors of 2 mm are 1.4 px at 5 m."""
 
-ODD_IMAGE = 6.0
-"""An image this many times farther off than others of its camera and purpose; good surveys reach 3.4."""
-
-FEW_IMAGES = 4
-
 LITTLE = 0.2
 """Corners that are off by less than this part of ``corner_px`` are no reason for doubt."""
 

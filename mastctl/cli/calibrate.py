@@ -102,9 +102,11 @@ def _calibrate(args: argparse.Namespace) -> Answer:
 
 def _refine(args: argparse.Namespace) -> Answer:
     """Propose a correction by hand-offs as a new mast file; 1, and no file, if they show none."""
+    from calib.errors import NoCorrection
     from calib.files.mast_file import load_rig
-    from mastctl.calibration.refined import pose_as_json, propose, save_refined
-    from mastctl.watch.handoffs import bias_record, read_log
+    from mastctl.calibration.mast_file import save_new
+    from mastctl.calibration.refined import refine
+    from mastctl.watch.handoffs import read_log
 
     for name in ("model", "report", "in_use", "method", "mast"):
         if getattr(args, name) is not None:
@@ -116,35 +118,20 @@ def _refine(args: argparse.Namespace) -> Answer:
     mast = load_rig(args.survey)
     for note in mast.notes:
         output.tell(note)
-    proposal = propose(mast, [read_log(path) for path in args.refine])
-    document: dict[str, Any] = {
-        "mast_file": None,
-        "former": {"path": str(proposal.mast.path), "digest": proposal.mast.digest},
-        "corrections": {
-            group: {**pose_as_json(pose), "significant": pose.significant}
-            for group, pose in proposal.poses.items()
-        },
-        "refusals": {
-            group: {"code": why.code, "message": str(why)} for group, why in proposal.refusals.items()
-        },
-        "bias": [bias_record(one) for one in proposal.bias],
-        "handoffs": len(proposal.handoffs),
-        "other_mast": proposal.other_mast,
-    }
+    document, found = refine(mast, [read_log(path) for path in args.refine])
     shown: list[str | Shown] = [
         *tables_at(document, REFINED),
-        *(one.sentence for one in proposal.bias),
-        f"{proposal.mast.path} is as it was; a daemon uses the new one after 'mastctl rig mast use'",
+        *(one["sentence"] for one in document["bias"]),
     ]
-    if not proposal.significant:
+    if isinstance(found, NoCorrection):
         if not args.json:
-            output.show(args, Answer(document, shown[:-1]))
-        refusal = proposal.refusal()
-        raise output.CommandError(refusal.code, f"{refusal}; nothing was written", detail=document)
-    saved, previous = save_refined(proposal, args.out)
+            output.show(args, Answer(document, shown))
+        raise output.CommandError(found.code, f"{found}; nothing was written", detail=document)
+    saved, previous = save_new(found, args.out)
     kept = None if previous is None else str(previous)
     document["mast_file"] = {"path": str(saved.path), "digest": saved.digest, "previous": kept}
-    return Answer(document, [*tables_of(document["mast_file"], "proposed mast file"), *shown])
+    after = f"{mast.path} is as it was; a daemon uses the new one after 'mastctl rig mast use'"
+    return Answer(document, [*tables_of(document["mast_file"], "proposed mast file"), *shown, after])
 
 
 def _from_survey(args: argparse.Namespace) -> Answer:
@@ -178,11 +165,11 @@ def families_of(args: argparse.Namespace, survey: Survey) -> tuple[dict[str, Any
     """Return what ``--compare-models`` adds for programs and for people."""
     if not args.compare_models:
         return {}, []
-    from mastctl.calibration import families
+    from mastctl.calibration.run import compared_models
 
     with output.waiting(args.json, "comparing camera models"):
-        found = families.compared(survey)
-    return {"models": families.families_as_json(survey, found)}, families.families_lines(survey, found)
+        models = compared_models(survey)
+    return {"models": models}, [f"{name}: {one['sentence']}" for name, one in models.items()]
 
 
 def _check_out(out: Path, survey: Survey) -> None:
