@@ -58,23 +58,14 @@ LENSES: dict[str, Kind] = {
 }
 """The lenses that can be requested, by the kind that a camera then is."""
 
-_OFFERED: dict[str, tuple[str, ...]] = {
-    "opencv": ("plumb_bob", "rational_polynomial", "equidistant"),
-    "ros": ("plumb_bob", "rational_polynomial", "equidistant"),
-    "kalibr": ("radtan", "equidistant"),
-    "mrcal": ("cahvor", "plumb_bob", "rational_polynomial"),
-    "cahvor": ("cahvor",),
-}
-"""Each format's lenses that a camera of another family is fitted as, the plainest first."""
-
-_STORED: dict[str, tuple[str, ...]] = {
+_LENSES_OF: dict[str, tuple[str, ...]] = {
     "opencv": ("radtan", "plumb_bob", "rational_polynomial", "thin_prism", "tilted", "equidistant"),
     "ros": ("plumb_bob", "rational_polynomial", "equidistant"),
     "kalibr": ("radtan", "equidistant"),
-    "mrcal": ("radtan", "plumb_bob", "rational_polynomial", "thin_prism"),
-    "cahvor": (),
+    "mrcal": ("cahvor", "radtan", "plumb_bob", "rational_polynomial", "thin_prism"),
+    "cahvor": ("cahvor",),
 }
-"""Each format's lenses that hold a camera of the same family as it is, the shortest first."""
+"""Each format's lenses, the shortest first."""
 
 
 def load_any(path: str | Path) -> StoredRig | CameraFile | dict[str, CameraFile]:
@@ -175,8 +166,8 @@ def save_any(
         raise BadFile(path, "", "the cameras are in several frames; a camchain places them in one")
     if lens and to in ("mastctl", "cahvor"):
         raise BadFile(path, "", f"'{to}' holds the camera's own model; leave the lens out")
-    if lens and lens not in (*_OFFERED[to], *_STORED[to]):
-        known = ", ".join(dict.fromkeys((*_OFFERED[to], *_STORED[to])))
+    if lens and lens not in _LENSES_OF[to]:
+        known = ", ".join(_LENSES_OF[to])
         raise BadFile(path, "", f"lens '{lens[:20]}' where one of {known} is expected for {to}")
     name, only = next(iter(cameras.items()))
     if to == "mastctl":
@@ -226,13 +217,16 @@ def nearest_lens(
     """
     if to != "cahvor" and np.cross(model.H, model.V) @ model.A < 0.0:
         raise ValueError("its image is mirrored (H x V is against A)")
-    for name in (lens,) if lens else _STORED[to]:
+    lenses = (lens,) if lens else _LENSES_OF[to]
+    for name in lenses:
         if name in LENSES and model.kind != "CAHV" and (same := as_kind(model, LENSES[name])) is not None:
             return name, same, twin_error(model, same)
+    if len(lenses) > 3:  # the others are as near as one of these, or nearly so
+        lenses = tuple(one for one in lenses if one not in ("radtan", "thin_prism", "tilted"))
     names: list[str] = []
     tried: list[tuple[CameraModel, TwinError]] = []
     problem = ""
-    for name in (lens,) if lens else _OFFERED[to]:
+    for name in lenses:
         try:
             with np.errstate(all="ignore"):
                 if name == "cahvor":

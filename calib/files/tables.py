@@ -128,11 +128,7 @@ class TableRow:
     def __init__(self, path: str | Path, place: str, columns: Sequence[str], cells: Sequence[str]) -> None:
         self.path, self.place = path, place
         if len(cells) != len(columns):
-            hint = ""
-            for delimiter, name in _OTHER_DELIMITERS.items():
-                if len(cells) == 1 and delimiter in cells[0]:
-                    hint = f", separated by ',' and not by {name}"
-            raise self.bad("", f"{len(cells)} cells where {len(columns)} are expected{hint}")
+            raise self.bad("", f"{len(cells)} cells where {len(columns)} are expected")
         self.cells = dict(zip(columns, map(str.strip, cells), strict=True))
 
     def bad(self, column: str, reason: str) -> BadFile:

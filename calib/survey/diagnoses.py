@@ -77,21 +77,12 @@ def wrong_points(survey: Survey) -> Iterator[SurveyFinding]:
 
 
 def wrong_dots(survey: Survey) -> Iterator[SurveyFinding]:
-    """Yield grids seen in a mirror, and images that share their dots."""
-    flipped, first_with = [], dict[bytes, str]()
+    """Yield grids that are seen in a mirror."""
+    flipped = []
     for name, dots in survey.dots.items():
         spread = _dots_per_board(survey, dots)
         if spread is not None and np.linalg.det(spread) < 0:
             flipped.append(name)
-        key = dots.pixels_px.tobytes()
-        if key in first_with:
-            yield SurveyFinding(
-                "error",
-                f"dots.csv, image {name}",
-                f"its dots are the very same as those of image {first_with[key]}",
-                "One is a copy: find the dots of this image again",
-            )
-        first_with.setdefault(key, name)
     if flipped:
         yield SurveyFinding(
             "error",

@@ -34,6 +34,7 @@ from calib.targets.boards import AnyBoard
 from calib.targets.pattern import pattern_of
 from drivers.recordings.pds3 import parse_label, read_product
 from hil_tests.calib.files.test_other_formats import CHAIN, INFO, MODEL, OPENCV
+from hil_tests.calib.survey.survey_case import FILES
 from hil_tests.calib.survey.test_bench import CORNERS, IMAGES, YAML
 from hil_tests.calib.targets.test_board_file import TEXT
 from hil_tests.drivers.test_pds3 import LABEL
@@ -96,7 +97,9 @@ VALID: dict[str, bytes] = {
     "pixels.csv": b"x_px,y_px\n320,240\n-1e9,0\ninf,0\n",
 }
 _BENCH = {"survey.yaml": YAML.encode(), "images.csv": IMAGES.encode(), "corners.csv": CORNERS.encode()}
-VALID |= {f"bench_{name}": data for name, data in _BENCH.items()}
+_STATION = {name: text.encode() for name, text in FILES.items()}
+for _kind, _files in (("bench", _BENCH), ("station", _STATION)):
+    VALID |= {f"{_kind}_{name}": data for name, data in _files.items()}
 
 _NASTY = [
     *b"nan -inf .inf 1e400 -1e308 5e-324 0 -0.0 ~ true '1' *a ? # \" ' = ^ : /* */".split(),
@@ -211,15 +214,17 @@ def _use_board(board: AnyBoard) -> None:
     pattern_of(board)
 
 
-def _use_bench(data: bytes, broken_file: str) -> None:
+def _use_survey(data: bytes, broken_file: str, files: Mapping[str, bytes]) -> None:
     with tempfile.TemporaryDirectory() as folder:
-        for name, valid in _BENCH.items():
+        for name, valid in files.items():
             (Path(folder) / name).write_bytes(data if name == broken_file else valid)
         survey = read_survey(folder)
         check_survey(survey)
         for image in survey.images:
             if image.name in survey.corners:
                 survey.boards[image.board].in_board_m(survey.corners[image.name].ids)
+            if image.name in survey.dots and not np.isfinite(survey.dots[image.name].pixels_px).all():
+                raise AssertionError("a dot that is nowhere was accepted")
 
 
 #: Reader name to the valid file that it reads and the reading.
@@ -235,9 +240,12 @@ READERS: dict[str, tuple[str, Callable[[bytes], Any]]] = {
     "kalibr": ("chain.kalibr.yaml", lambda data: _use_all(parse_kalibr(data, "f"))),
     "mrcal": ("camera.cameramodel", lambda data: _use_model(parse_mrcal(data, "f"))),
     "board": ("board.yaml", lambda data: _use_board(parse_board(data, "f"))),
-    "bench": ("bench_survey.yaml", lambda data: _use_bench(data, "survey.yaml")),
-    "bench images": ("bench_images.csv", lambda data: _use_bench(data, "images.csv")),
-    "bench corners": ("bench_corners.csv", lambda data: _use_bench(data, "corners.csv")),
+    "bench": ("bench_survey.yaml", lambda data: _use_survey(data, "survey.yaml", _BENCH)),
+    "bench images": ("bench_images.csv", lambda data: _use_survey(data, "images.csv", _BENCH)),
+    "bench corners": ("bench_corners.csv", lambda data: _use_survey(data, "corners.csv", _BENCH)),
+    "survey": ("station_survey.yaml", lambda data: _use_survey(data, "survey.yaml", _STATION)),
+    "station": ("station_station.csv", lambda data: _use_survey(data, "station.csv", _STATION)),
+    "dots": ("station_dots.csv", lambda data: _use_survey(data, "dots.csv", _STATION)),
     "points": ("points.csv", lambda data: parse_table(data, "f", ("x_m", "y_m", "z_m"))),
     "pixels": ("pixels.csv", lambda data: parse_table(data, "f", ("x_px", "y_px"))),
 }

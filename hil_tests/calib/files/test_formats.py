@@ -333,7 +333,7 @@ def test_a_table_without_rows_is_empty() -> None:
         (b"1,2,3\n", "line 1", "expected 'x_m,y_m,z_m'"),
         (b"x_m;y_m;z_m\n1;2;3\n", "line 1", "separated by ';'"),
         (b"x_m\ty_m\tz_m\n1\t2\t3\n", "line 1", "separated by tab"),
-        (b"x_m,y_m,z_m\n1,2,3\n1;2;3\n", "row 2 (line 3)", "not by ';'"),
+        (b"x_m,y_m,z_m\n1,2,3\n1;2;3\n", "row 2 (line 3)", "1 cells where 3"),
         (b"x_m,y_m,z_m\n1,2\n", "row 1 (line 2)", "2 cells where 3"),
         (b"x_m,y_m,z_m\n1,2,3,\n", "row 1 (line 2)", "4 cells where 3"),
         (b"x_m,y_m,z_m\n1,2,3\n4,five,6\n", "row 2 (line 3), y_m", "'five'"),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -277,45 +276,6 @@ def test_a_writing_that_fails_leaves_nothing(tmp_path: Path, folder: Path) -> No
     with pytest.raises(BadFile, match=r"station\.csv: line 2, x_m: nan"):
         write_survey(survey, tmp_path / "new")
     assert [path.name for path in tmp_path.iterdir()] == [folder.name]
-
-
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(seed=st.integers(0, 2**32))
-def test_spoiled_bytes_are_read_or_refused_and_nothing_else(tmp_path: Path, seed: int) -> None:
-    rng = random.Random(seed)
-    folder = write_files(tmp_path / "survey")
-    path = folder / rng.choice(list(FILES))
-    data = bytearray(path.read_bytes())
-    for _ in range(rng.randint(1, 8)):
-        at = rng.randrange(len(data) + 1)
-        match rng.randrange(4):
-            case 0:
-                data[at : at + rng.randint(1, 20)] = b""
-            case 1:
-                data[at:at] = rng.choice([b"nan", b",", b"\n", b'"', b"\x00", b"\xff", b"1e999", b": ", b"{"])
-            case 2:
-                data[at : at + 1] = bytes([rng.randrange(256)])
-            case _:
-                start = rng.randrange(len(data) + 1)
-                data[at:at] = data[start : start + 40]
-    path.write_bytes(bytes(data))
-    try:
-        survey = read_survey(folder)
-    except BadFile as error:
-        assert "\n" not in str(error), f"seed {seed}"
-    else:
-        assert all(np.isfinite(p.position_m).all() for p in survey.station), f"seed {seed}"
-        assert all(np.isfinite(d.pixels_px).all() for d in survey.dots.values()), f"seed {seed}"
-
-
-@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(name=st.sampled_from(list(FILES)), data=st.binary(max_size=200))
-def test_any_bytes_are_refused_in_one_line(tmp_path: Path, name: str, data: bytes) -> None:
-    folder = write_files(tmp_path / "survey")
-    (folder / name).write_bytes(data)
-    with pytest.raises(BadFile) as caught:
-        read_survey(folder)
-    assert "\n" not in str(caught.value)
 
 
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
