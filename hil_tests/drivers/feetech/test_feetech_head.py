@@ -304,7 +304,7 @@ def test_scan_and_info_read_feetech_servos_and_move_none(
     code, told, _ = run(capsys, "info", cli.line.path, "1")
     assert (code, told["model"]) == (0, "STS3215")
     assert told["registers"]["present_position"] == 2048 + 7
-    assert told["registers"]["offset"] == -7 and "never writes it" in told["words"]["offset"]
+    assert told["registers"]["offset"] == -7 and "never writes it" in told["meanings"]["offset"]
     assert cli.pan_rad() == 0.0 and cli.servos[0].eeprom_writes == []
 
 
