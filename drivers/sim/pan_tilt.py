@@ -57,10 +57,7 @@ class SimulatedPanTilt(PanTilt):
         self._faults = faults or FaultPanel(clock.now_s, ())
         self._lock = threading.RLock()
         now_s = clock.now_s()
-        self._axes = (
-            WireAxis(head.pan, self._faults, number=0, resumes=False, time_s=now_s),
-            WireAxis(head.tilt, self._faults, number=1, resumes=False, time_s=now_s),
-        )
+        self._axes = _axes(head, self._faults, now_s, resumes=False)
         self._closed = False
 
     def read(self) -> Reading:
@@ -203,6 +200,12 @@ class SimulatedPanTilt(PanTilt):
         return result
 
 
+def _axes(head: HeadModel, faults: FaultPanel, time_s: float, resumes: bool) -> tuple[WireAxis, WireAxis]:
+    """Pan and tilt."""
+    pan = WireAxis(head.pan, faults, number=0, time_s=time_s, resumes=resumes)
+    return pan, WireAxis(head.tilt, faults, number=1, time_s=time_s, resumes=resumes)
+
+
 class WiredHead:
     """Axes, the simulator that turns them, the line to it, and the real driver at its other end.
 
@@ -215,10 +218,7 @@ class WiredHead:
         if not clock.runs:
             raise BadOptions(f"simulation.wire {wire!r} needs a clock that goes on by itself")
         now_s = clock.now_s()
-        self._axes = (
-            WireAxis(head.pan, faults, number=0, time_s=now_s),
-            WireAxis(head.tilt, faults, number=1, time_s=now_s),
-        )
+        self._axes = _axes(head, faults, now_s, resumes=True)
         make = _dynamixel if wire == "dynamixel" else _flir_ptu
         device, open_head, options = make(WIRED_HEADS[head.name], head, self._axes, now_s)
         if head.pan.settle_s > 0:

@@ -14,7 +14,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Callable
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -24,7 +24,6 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from calib.geometry.rigid import Rigid, rot_x, rot_y, rot_z
 from drivers.sim import kernels, rocks
 from drivers.sim.kept import digest_of, keep_newest, kept_folder
 from drivers.sim.placed import SceneSettings, middle_m, radius_m
@@ -86,22 +85,9 @@ class Scene:
         """Return z of the ground (rocks apart) under (x, y), metres in the site frame."""
         return ground_z_m(self.world.inner, x_m, y_m)
 
-    def standing(
-        self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
-    ) -> Rigid:
-        """Return site_from_rover of a rover whose origin lies on the ground at (x, y), metres.
-
-        It is turned about its x (roll), then y (pitch, nose up), then z (heading, to the right).
-        """
-        rotation = rot_z(heading_rad) @ rot_y(pitch_rad) @ rot_x(roll_rad)
-        return Rigid(rotation, np.array([x_m, y_m, self.ground_z_m(x_m, y_m)]))
-
 
 def build_scene(settings: SceneSettings | None = None) -> Scene:
-    """Return the scene of ``settings``; takes some two seconds once the kernels are compiled.
-
-    Raises BadOptions if numba is not installed.
-    """
+    """Return the scene of ``settings``; takes some two seconds once the kernels are compiled."""
     settings = settings or SceneSettings()
     # one stream of numbers for each part: a flat scene keeps the stones and gravel of the rough one
     relief_rng, hill_rng, rock_rng, gravel_rng, tone_rng, stone_rng, brick_rng, placed_rng = (
@@ -110,9 +96,7 @@ def build_scene(settings: SceneSettings | None = None) -> Scene:
     sun = sun_direction(settings)
     inner = make_grid(inner_relief_m(settings, relief_rng), INNER_CELL_M)
     outer = make_grid(outer_relief_m(settings, hill_rng), OUTER_CELL_M)
-    stones, laid = laid_out(settings, rock_rng, brick_rng, placed_rng, partial(ground_z_m, inner))
-    if laid:
-        stones = rocks.together(stones, rocks.meshes(laid))
+    stones = laid_out(settings, (rock_rng, brick_rng, placed_rng), partial(ground_z_m, inner))
     tones = ground_tones(inner, sun, tone_rng) * shadows(inner, stones, sun)
     detail = pyramid(gravel(gravel_rng, sun, DETAIL_TEXELS), DETAIL_TEXEL_M)
     surface = pyramid(stone(stone_rng, STONE_TEXELS), STONE_TEXEL_M)
@@ -121,13 +105,13 @@ def build_scene(settings: SceneSettings | None = None) -> Scene:
 
 
 def laid_out(
-    settings: SceneSettings,
-    rock_rng: np.random.Generator,
-    brick_rng: np.random.Generator,
-    placed_rng: np.random.Generator,
-    ground_m: Callable[[float, float], float],
-) -> tuple[kernels.Rocks, list[Float64]]:
-    """Return ``kernels.Rocks`` of the stones, and the bricks; scattered ones keep away from placed things."""
+    settings: SceneSettings, chance: Sequence[np.random.Generator], ground_m: rocks.GroundHeight
+) -> kernels.Rocks:
+    """Return stones and bricks; scattered ones keep away from placed things.
+
+    ``chance`` scatters rocks, scatters bricks, and shapes placed rocks.
+    """
+    rock_rng, brick_rng, placed_rng = chance
     placed = settings.placed.values()
     taken_m = np.array([[*middle_m(thing), 0.0, radius_m(thing)] for thing in placed]).reshape(-1, 4)
     if isinstance(settings.rocks, tuple):
@@ -135,20 +119,18 @@ def laid_out(
         stones = rocks.stones_at(where, placed_rng, ground_m, [rock.heading_rad for rock in settings.rocks])
     else:
         stones = rocks.make_rocks(settings.rocks, rock_rng, ground_m)
-        apart = stones.spheres_m[:, None] - taken_m[None]
-        free = (np.hypot(apart[..., 0], apart[..., 1]) > stones.spheres_m[:, None, 3] + taken_m[:, 3]).all(
-            axis=1
-        )
-        stones = type(stones)(*(np.ascontiguousarray(part[free]) for part in stones))
+        apart_m = np.hypot(*(stones.spheres_m[:, None] - taken_m[None])[..., :2].transpose(2, 0, 1))
+        free = (apart_m > stones.spheres_m[:, None, 3] + taken_m[:, 3]).all(axis=1)
+        stones = kernels.Rocks(*(np.ascontiguousarray(part[free]) for part in stones))
     if isinstance(settings.bricks, tuple):
-        return stones, [
-            rocks.make_brick(
-                one.x_m, one.y_m, one.heading_rad, ground_m, (one.length_m, one.width_m, one.height_m)
-            )
-            for one in settings.bricks
+        bricks = [
+            rocks.make_brick(b.x_m, b.y_m, b.heading_rad, ground_m, (b.length_m, b.width_m, b.height_m))
+            for b in settings.bricks
         ]
-    taken_m = np.concatenate([stones.spheres_m, taken_m])
-    return stones, rocks.scattered(settings.bricks, brick_rng, taken_m, ground_m)
+    else:
+        taken_m = np.concatenate([stones.spheres_m, taken_m])
+        bricks = rocks.scattered(settings.bricks, brick_rng, taken_m, ground_m)
+    return rocks.together(stones, rocks.meshes(bricks)) if bricks else stones
 
 
 def sun_direction(settings: SceneSettings) -> Float64:
@@ -262,7 +244,9 @@ def shadows(grid: kernels.Grid, stones: kernels.Rocks, sun: Float64) -> NDArray[
         ys = (np.arange(low[1], high[1])[:, None] + fine).ravel() * grid.cell_m + grid.y0_m
         points = np.empty((len(ys), len(xs), 3))
         points[..., 0], points[..., 1] = xs, ys[:, None]
-        points[..., 2] = coarse_z_m(grid, low, high)
+        e = grid.elevation_m[low[1] : high[1] + 1, low[0] : high[0] + 1].astype(np.float64)
+        middle_z_m = -0.25 * (e[:-1, :-1] + e[:-1, 1:] + e[1:, :-1] + e[1:, 1:])  # of each cell
+        points[..., 2] = np.repeat(np.repeat(middle_z_m, SHADOW_SAMPLES, axis=0), SHADOW_SAMPLES, axis=1)
         clear = np.empty(points[..., 0].size, dtype=np.float32)
         kernels.shadow_rays(stones, sun, points.reshape(-1, 3), clear)
         q = SHADOW_SAMPLES
@@ -270,13 +254,6 @@ def shadows(grid: kernels.Grid, stones: kernels.Rocks, sun: Float64) -> NDArray[
         block = kept[low[1] : high[1], low[0] : high[0]]
         np.minimum(block, in_shade + (1.0 - in_shade) * clear, out=block)
     return kept
-
-
-def coarse_z_m(grid: kernels.Grid, low: NDArray[np.int64], high: NDArray[np.int64]) -> Float64:
-    """z at the shadow samples of a block of cells [low, high): each cell's mean height, repeated."""
-    e = grid.elevation_m[low[1] : high[1] + 1, low[0] : high[0] + 1].astype(np.float64)
-    middle = -0.25 * (e[:-1, :-1] + e[:-1, 1:] + e[1:, :-1] + e[1:, 1:])
-    return np.repeat(np.repeat(middle, SHADOW_SAMPLES, axis=0), SHADOW_SAMPLES, axis=1)
 
 
 def fractal(

@@ -13,7 +13,7 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol, TypeVar
+from typing import Literal, Protocol, Self
 
 from drivers.clock import Clock
 from drivers.faults import PAN_TILT, Fault, FaultPanel
@@ -30,8 +30,6 @@ _BITS_PER_BYTE = 10  # 8N1: start, eight, stop
 
 Observer = Callable[[Literal["host", "device"], bytes, float], None]
 """Called in the line's thread with the sender, the bytes, and when they were through."""
-
-_L = TypeVar("_L", bound="Line")
 
 
 @dataclass(frozen=True)
@@ -181,7 +179,7 @@ class Line(ABC):
         self._disconnect()
         self._dismantle()
 
-    def __enter__(self: _L) -> _L:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *raised: object) -> None:

@@ -100,13 +100,8 @@ class Drive:
         self._table["goal_position"] = self.position(time_s)
         self._table["goal_velocity"] = 0
 
-    def torque_off(self, time_s: float) -> None:
-        """Let the axis go."""
-        self.axis.halt(time_s)
-        self.rest(time_s)
-
     def stop(self, time_s: float) -> None:
-        """Stop as the bus watchdog does: at once, as though both profile registers were 0."""
+        """Stop at once, as though both profile registers were 0; so do the bus watchdog and torque off."""
         self.axis.halt(time_s)
         self.rest(time_s)
 

@@ -108,7 +108,7 @@ class SimulatedServo:
             return
         self.powered = on
         self.table["torque_enable"] = 0
-        self.drive.torque_off(time_s)
+        self.drive.stop(time_s)
         if on:
             self._boot(time_s)
 
@@ -173,7 +173,7 @@ class SimulatedServo:
     def reboot(self, time_s: float) -> None:
         """Start anew: torque drops at once, errors are gone, the RAM area is as from the factory."""
         self.table["torque_enable"] = 0
-        self.drive.torque_off(time_s)
+        self.drive.stop(time_s)
         self._boot(time_s)
 
     # Inside
@@ -192,7 +192,7 @@ class SimulatedServo:
         if on:
             self.drive.torque_on(time_s)
         else:
-            self.drive.torque_off(time_s)
+            self.drive.stop(time_s)
 
     def _reset_mode(self, time_s: float) -> None:
         """A new operating mode: the profile and the limits of the goals are reset."""
