@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import combinations
 from typing import Annotated, Any, Self
 
 import cv2
@@ -176,35 +177,20 @@ def radius_m(thing: Placed) -> float:
     return float(np.linalg.norm(footprint_m(thing) - middle_m(thing), axis=1).max())
 
 
-def heights_m(thing: Placed) -> tuple[float, float]:
-    """Return from where to where a thing reaches over the ground."""
-    if isinstance(thing, PlacedRock):
-        return 0.0, 0.8 * thing.diameter_m
-    if isinstance(thing, PlacedBrick):
-        return 0.0, thing.height_m
-    return thing.raised_m, thing.raised_m + thing.size_m[1] * math.cos(thing.lean_rad)
-
-
 def check_apart(things: Mapping[str, Placed]) -> None:
-    """Pass things of which none stands in another. Raises BadOptions with the first pair."""
-    outlines = {key: footprint_m(thing).astype(np.float32) for key, thing in things.items()}
-    keys = list(things)
-    for k, key in enumerate(keys):
-        low, high = heights_m(things[key])
-        for other in keys[:k]:
-            other_low, other_high = heights_m(things[other])
-            if min(high, other_high) <= max(low, other_low):
-                continue
-            area_m2, _ = cv2.intersectConvexConvex(_hull(outlines[key]), _hull(outlines[other]))
-            if area_m2 > 1e-6:
-                raise BadOptions(
-                    f"{key} at ({things[key].x_m:g}, {things[key].y_m:g}) m stands in {other} at "
-                    f"({things[other].x_m:g}, {things[other].y_m:g}) m, expected things apart from each other"
-                )
+    """Raise BadOptions with the first pair of things of which one stands in the other."""
+    outlines = {key: _hull(footprint_m(thing).astype(np.float32)) for key, thing in things.items()}
+    for (other, before), (key, outline) in combinations(outlines.items(), 2):
+        area_m2, _ = cv2.intersectConvexConvex(outline, before)
+        if area_m2 > 1e-6:
+            raise BadOptions(
+                f"{key} at ({things[key].x_m:g}, {things[key].y_m:g}) m stands in {other} at "
+                f"({things[other].x_m:g}, {things[other].y_m:g}) m, expected things apart from each other"
+            )
 
 
 def check_clear_of(things: Mapping[str, Placed], rig: Rig) -> None:
-    """Pass things that stand outside the rover, and where no camera can come. Raises BadOptions."""
+    """Raise BadOptions for a thing in the rover, or where one of its cameras can come."""
     reach_m = ROVER_M
     mast_m = float(np.hypot(*rig.mast.translation_m[:2])) + abs(rig.mast.axis_offset_m)
     for camera in rig.cameras.values():
