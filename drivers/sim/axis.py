@@ -364,9 +364,9 @@ class WireAxis:
         self._continue(self._motion.jammed(time_s), time_s)
         self._order = self._order if self._resumes else None
 
-    def _fault(self, word: str, time_s: float) -> Fault | None:
-        """The fault of this word if it concerns this axis now."""
-        fault = self._faults.find(PAN_TILT, word, time_s) if self._faults is not None else None
+    def _fault(self, name: str, time_s: float) -> Fault | None:
+        """The fault of this name if it concerns this axis now."""
+        fault = self._faults.find(PAN_TILT, name, time_s) if self._faults is not None else None
         if fault is None or fault.parameters.get("axis", 2.0) not in (2.0, float(self._number)):
             return None
         return fault

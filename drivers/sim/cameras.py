@@ -1,6 +1,6 @@
 """Simulated cameras: frames at fixed instants, rendered only on request.
 
-Frame n of a camera is exposed at a fixed instant whether or not anybody looks, so its sequence number is a
+Frame n of a camera is exposed at a fixed instant whether or not it is requested, so its sequence number is a
 function of time and a frame that was not fetched is a gap. All cameras of a rover share the instants, as with
 a hardware trigger, unless a camera's clock says otherwise. A camera remembers as many finished frames as a
 capture ring would.
@@ -219,7 +219,7 @@ class SimulatedCamera(Camera):
     def exposure_held(self) -> Iterator[None]:
         """Return a context in which the exposure does not change."""
         self._hang(EXPOSURE_HELD)
-        with self._exposure.held():
+        with self._exposure.fixed():
             yield
 
     def close(self) -> None:

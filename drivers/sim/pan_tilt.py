@@ -76,10 +76,10 @@ class SimulatedPanTilt(PanTilt):
         number; nothing moves then; NoReply, BadReply.
         """
         axes = (("pan", self.head.pan, pan_rad), ("tilt", self.head.tilt, tilt_rad))
-        for word, axis, goal in axes:
+        for name, axis, goal in axes:
             if not axis.low_rad <= goal <= axis.high_rad:
                 raise DriverError(
-                    f"{word} {goal:.4f} rad is outside the device's own range "
+                    f"{name} {goal:.4f} rad is outside the device's own range "
                     f"{axis.low_rad:.4f} to {axis.high_rad:.4f} rad",
                     device=self.head.name,
                 )
@@ -96,7 +96,7 @@ class SimulatedPanTilt(PanTilt):
         self._call(start)
 
     def stop(self) -> None:
-        """Brake both axes and hold where they come to rest. Raises NoReply and BadReply as ``read``."""
+        """Brake both axes; they stay where they come to rest. Raises NoReply and BadReply as ``read``."""
         self._call(self._halt)
 
     def close(self) -> None:
@@ -180,15 +180,15 @@ class SimulatedPanTilt(PanTilt):
                 axis.follow(now_s)
             if self._closed:
                 raise NoReply("it is closed", device=name)
-            gone = faults.find(PAN_TILT, "hang_up", now_s)
-            deaf = gone or faults.find(PAN_TILT, "off", now_s) or faults.strikes(PAN_TILT, now_s)
+            hung_up = faults.find(PAN_TILT, "hang_up", now_s)
+            deaf = hung_up or faults.find(PAN_TILT, "off", now_s) or faults.strikes(PAN_TILT, now_s)
             if not deaf:
                 result = action(now_s)
                 silent = faults.takes(PAN_TILT, "mute", now_s) or faults.takes(PAN_TILT, "half", now_s)
                 dead = any(axis.silent(now_s) for axis in self._axes)
                 damaged = faults.takes(PAN_TILT, "corrupt", now_s) or faults.takes(PAN_TILT, "swapped", now_s)
                 late = faults.find(PAN_TILT, "delayed", now_s) or faults.takes(PAN_TILT, "late", now_s)
-        if gone:
+        if hung_up:
             raise NoReply("the line is gone", device=name)
         wait_s = late.number("delay_s") if not deaf and late else 0.0
         if deaf or silent or dead or (late and late.word == "late" and wait_s > REPLY_TIMEOUT_S):

@@ -26,7 +26,7 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.covariance import rig_in_mode
 from calib.geometry.mode import BadMode, Mode, SensorMode, sensor_mode_after
 from calib.geometry.rig import Rig
-from calib.geometry.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
+from calib.geometry.rigid import FloatArray, Rigid
 from calib.targets.boards import FLAT, AnyBoard
 from drivers.clock import Clock
 from drivers.errors import BadOptions, NoFreshFrame
@@ -177,8 +177,8 @@ class RoverModel:
     ) -> Rigid:
         """Put the rover's origin on the ground at (x, y) of the site frame, at once; return site_from_rover.
 
-        It is turned about its x (roll), then y (pitch, nose up), then z (heading, to the right). Raises
-        BadOptions farther than ``REACH_M`` from the middle of the ground, or for an angle that is no number.
+        The angles are those of `Scene.standing`. Raises BadOptions farther than ``REACH_M`` from the middle
+        of the ground, or for an angle that is no number.
         """
         for name, angle in (("heading", heading_rad), ("pitch", pitch_rad), ("roll", roll_rad)):
             if not math.isfinite(angle):
@@ -187,13 +187,12 @@ class RoverModel:
             raise BadOptions(
                 f"({x_m:g}, {y_m:g}) m is off the simulated ground, which ends {REACH_M:g} m from its middle"
             )
-        rotation = rot_z(heading_rad) @ rot_y(pitch_rad) @ rot_x(roll_rad)
-        self.site_from_rover = Rigid(rotation, np.array([x_m, y_m, self.scene.ground_z_m(x_m, y_m)]))
+        self.site_from_rover = self.scene.standing(x_m, y_m, heading_rad, pitch_rad, roll_rad)
         return self.site_from_rover
 
     @property
     def boards(self) -> Mapping[str, BenchBoard]:
-        """The boards that are held up before the rover, by name."""
+        """The boards that requests put before the rover, by name."""
         return self._boards.boards
 
     def put_board(

@@ -24,6 +24,7 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
+from calib.geometry.rigid import Rigid, rot_x, rot_y, rot_z
 from drivers.sim import kernels, rocks
 from drivers.sim.kept import digest_of, keep_newest, kept_folder
 from drivers.sim.placed import SceneSettings, middle_m, radius_m
@@ -84,6 +85,16 @@ class Scene:
     def ground_z_m(self, x_m: float, y_m: float) -> float:
         """Return z of the ground (rocks apart) under (x, y), metres in the site frame."""
         return ground_z_m(self.world.inner, x_m, y_m)
+
+    def standing(
+        self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
+    ) -> Rigid:
+        """Return site_from_rover of a rover whose origin lies on the ground at (x, y), metres.
+
+        It is turned about its x (roll), then y (pitch, nose up), then z (heading, to the right).
+        """
+        rotation = rot_z(heading_rad) @ rot_y(pitch_rad) @ rot_x(roll_rad)
+        return Rigid(rotation, np.array([x_m, y_m, self.ground_z_m(x_m, y_m)]))
 
 
 def build_scene(settings: SceneSettings | None = None) -> Scene:

@@ -67,7 +67,7 @@ class FixedExposure:
         """The newest exposure time and gain."""
         return self._set[-1][1:]
 
-    def held(self) -> AbstractContextManager[None]:
+    def fixed(self) -> AbstractContextManager[None]:
         """Return a context in which nothing changes: nothing does so by itself."""
         return nullcontext()
 
@@ -111,7 +111,7 @@ class AutoExposure:
         self._now_s = now_s
         self._amounts_s: dict[int, float] = {}  # time times gain, by frame
         self._next_frame = 0
-        self._holds: list[list[float]] = []  # from when until when the exposure stays as it is
+        self._fixed: list[list[float]] = []  # from when until when the exposure stays as it is
         self._lock = threading.Lock()
 
     @property
@@ -120,15 +120,15 @@ class AutoExposure:
         return None
 
     @contextmanager
-    def held(self) -> Iterator[None]:
+    def fixed(self) -> Iterator[None]:
         """Keep the exposure of all frames that begin inside the block as it is."""
-        hold = [self._now_s(), math.inf]
+        span = [self._now_s(), math.inf]
         with self._lock:
-            self._holds = [*self._holds[-50:], hold]
+            self._fixed = [*self._fixed[-50:], span]
         try:
             yield
         finally:
-            hold[1] = self._now_s()
+            span[1] = self._now_s()
 
     def longest_s(self, _now_s: float) -> float:
         """Return the longest exposure time that a frame may have."""
@@ -159,7 +159,7 @@ class AutoExposure:
         amounts_s, s = self._amounts_s, self._settings
         before_s = amounts_s.get(frame - 1, self._exposure_s)
         seen = frame - s.lag_frames
-        if seen < 0 or any(since_s <= begin_s < until_s for since_s, until_s in self._holds):
+        if seen < 0 or any(since_s <= begin_s < until_s for since_s, until_s in self._fixed):
             return before_s
         seen_s = begin_s - s.lag_frames * period_s
         seen_with_s = amounts_s.get(seen, before_s)

@@ -129,7 +129,7 @@ class WireDevice(Protocol):
         ...
 
     def poll(self, time_s: float) -> Sequence[Reply]:
-        """Return what it sends by itself, or at last sends for an answer that it held back."""
+        """Return what it sends by itself, or at last sends for an answer that it delayed."""
         ...
 
 

@@ -15,13 +15,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 from drivers.sim.wire.carrier import Reply
-from drivers.sim.wire.dynamixel_servo import SimulatedServo
-from drivers.sim.wire.dynamixel_table import (
+from drivers.sim.wire.dynamixel_models import (
     CRC_ERROR,
     DATA_LENGTH,
     INSTRUCTION_ERROR,
     InstructionRefused,
 )
+from drivers.sim.wire.dynamixel_servo import SimulatedServo
 
 HEADER = b"\xff\xff\xfd\x00"
 BROADCAST = 0xFE

@@ -12,8 +12,7 @@ import math
 
 from drivers.sim.axis import WireAxis
 from drivers.sim.motion import Motion
-from drivers.sim.wire.dynamixel_models import SimulatedModel
-from drivers.sim.wire.dynamixel_table import MODES, POSITION_MODE, ControlTable
+from drivers.sim.wire.dynamixel_models import MODES, POSITION_MODE, ControlTable, SimulatedModel
 
 STEP_RAD_PER_S2 = 60.0
 """Acceleration where the profile has an infinite one (assumed; the manual gives none)."""

@@ -7,11 +7,13 @@ from collections.abc import Callable, Mapping
 from drivers.errors import BadOptions
 from drivers.sim.axis import WireAxis
 from drivers.sim.wire.dynamixel_drive import Drive
-from drivers.sim.wire.dynamixel_models import BAUD_RATES, SimulatedModel, model_named
-from drivers.sim.wire.dynamixel_table import (
+from drivers.sim.wire.dynamixel_models import (
+    BAUD_RATES,
     MODES,
     WATCHDOG_EXPIRED,
     ControlTable,
+    SimulatedModel,
+    model_named,
 )
 
 ALERT = 0x80
@@ -31,7 +33,7 @@ _ANSWER_BITS = 120.0  # of an answer without data, and a byte to spare
 class SimulatedServo:
     """One servo; every method is given the time and nothing runs by itself.
 
-    Raises BadOptions for an unknown model or register, or a value that the register cannot hold.
+    Raises BadOptions for an unknown model or register, or a value beyond its bounds.
 
     ``settings`` are initial values of registers, by name; those of the EEPROM outlast a reboot.
     """
@@ -99,7 +101,7 @@ class SimulatedServo:
         self._fed_s = time_s
 
     def answers(self, code: str) -> bool:
-        """Return whether the status return level lets it answer ``ping``, ``read`` or another word."""
+        """Return whether the status return level lets it answer ``ping``, ``read`` or another instruction."""
         return self.table["status_return_level"] >= {"ping": 0, "read": 1}.get(code, 2)
 
     def set_power(self, on: bool, time_s: float) -> None:

@@ -134,7 +134,7 @@ class SimulatedFeetechServo:
     """One servo; every method is given the time and nothing runs by itself.
 
     ``settings`` are initial values of its memory by name; those of the EEPROM outlast the power switch.
-    Raises BadOptions for an unknown model or name, or a value that the memory cannot hold.
+    Raises BadOptions for an unknown model or name, or a value beyond its bounds.
     """
 
     def __init__(
@@ -252,7 +252,7 @@ class SimulatedFeetechServo:
     def _put(self, name: str, value: int, address: int, time_s: float) -> None:
         if name == "torque_enable" and value != self.memory[name]:
             if value:
-                self.memory["goal_position"] = self._position(time_s)  # it holds where it stands
+                self.memory["goal_position"] = self._position(time_s)  # it stays where it is
             else:
                 self._axis.halt(time_s)
         self.memory[name] = value

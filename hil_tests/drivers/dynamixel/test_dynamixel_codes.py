@@ -13,7 +13,7 @@ import pytest
 
 from drivers.dynamixel import models as driver
 from drivers.dynamixel import packets
-from drivers.sim.wire import dynamixel_models, dynamixel_servo, dynamixel_table
+from drivers.sim.wire import dynamixel_models, dynamixel_servo
 
 # _includes/en/dxl/control_table_baudrate_2.md (X and MX: 0 to 7, XL330 and XC330: 0 to 6) and
 # _includes/en/dxl/p/control_table_8_baud_rate.md (P: 0 to 9).
@@ -68,10 +68,10 @@ def test_both_have_the_makers_hardware_error_bits() -> None:
 
 def test_both_have_the_makers_operating_modes_and_errors() -> None:
     assert dict(driver.OPERATING_MODES) == OPERATING_MODES
-    assert [OPERATING_MODES[one] for one in dynamixel_table.MODES] == ["position", "extended position"]
+    assert [OPERATING_MODES[one] for one in dynamixel_models.MODES] == ["position", "extended position"]
     assert set(packets.REFUSALS) == ERRORS.keys()
     # 1 is of instructions that are not simulated
-    assert all(getattr(dynamixel_table, name) == error for error, name in ERRORS.items() if error > 1)
+    assert all(getattr(dynamixel_models, name) == error for error, name in ERRORS.items() if error > 1)
 
 
 def test_every_model_number_is_that_of_the_installed_sdk() -> None:
