@@ -33,7 +33,6 @@ CHEAP = [
     "tools.campaigns.refine --rig configs/sim/rocky8.yaml --cases 1",
     "tools.campaigns.residuals --cases 1 --day kind",
     "tools.campaigns.sweep joints --cases 1 --distances 2",
-    "tools.campaigns.uneven_noise noisy-bench --cases 1",
     "tools.flight.real_handoff hil_tests/data/mer_navcam",
     "tools.flight.validation",
     "tools.simulated.survey --rig configs/sim/rocky8.yaml --out {folder}/survey --seed 1",

@@ -44,6 +44,38 @@ class RigSummary(TypedDict):
     mast_files: list[str]
 
 
+class PanoramaListed(TypedDict):
+    """A panorama: how it stands, and how many views are taken, wanted, missing, forbidden."""
+
+    id: str
+    time: str
+    state: Literal["running", "done", "ended"]
+    reason: str
+    camera: str
+    mast_digest: str
+    views: dict[str, int]
+
+
+class PanoramaList(TypedDict):
+    """``GET /panoramas``: the newest first."""
+
+    panoramas: list[PanoramaListed]
+
+
+class KeptTarget(TypedDict):
+    """A point kept by a name, in the site frame where a pose was known; its covariance where one is."""
+
+    position_m: Point
+    frame: Literal["site", "rover"]
+    covariance_m2: list[Point] | None
+
+
+class TargetList(TypedDict):
+    """``GET /targets``: by name."""
+
+    targets: dict[str, KeptTarget]
+
+
 class CameraTurn(TypedDict):
     """How far a camera seems turned, by the axes of the frame that it is mounted on."""
 

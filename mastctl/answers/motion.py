@@ -132,8 +132,8 @@ class Refusal(TypedDict):
 class Preview(TypedDict):
     """``POST /point/preview``: what a clicked pixel shows in a fresh frame, before anything moves.
 
-    ``other_...``, the match's figures, ``sigma_m`` and ``range_sigma_m`` (one sigma, of the clicks and not of
-    the mast file) are null where one camera points alone; ``range_interval_m`` where a pair does.
+    ``other_...``, the match's figures, ``sigma_m``, ``covariance_m2`` and ``range_sigma_m`` (of the clicks,
+    not of the mast file) are null where one camera points alone; ``range_interval_m`` where a pair does.
     ``goal_rad`` is null where no move leads there, ``refused`` where the head would be sent.
     """
 
@@ -149,6 +149,7 @@ class Preview(TypedDict):
     across_px: float | None
     position_m: Point
     sigma_m: Point | None
+    covariance_m2: Annotated[list[Point], Len(3, 3)] | None
     range_m: float
     range_sigma_m: float | None
     range_from: str

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 POLL_S = 0.05  # how often it is checked that the daemon still takes the heartbeats
 
-PIXEL = option("--pixel CAMERA FRAME_ID X Y", "a pixel of a named frame")
+PIXEL = option("--pixel CAMERA FRAME_ID X Y", "a pixel of a named frame; X Y with --panorama", nargs="+")
 CAMERA = option("--camera NAME", "a pixel (--at) of a snapshot taken now by this camera")
 POSITION = option("--position X Y Z", "a point, metres")
 AT = option("--at X Y", "the pixel, with --camera")
@@ -42,6 +42,9 @@ FRAME = option("--frame rover|site", "frame of --position (default rover)")
     ),
     AT,
     FRAME,
+    option("--panorama FOLDER", "the pixel (--pixel X Y) is one of this panorama's mosaic"),
+    option("--recompute", "with --panorama: it may be of another mast file"),
+    option("--by-direction", "with --panorama: nothing is found again in a picture"),
     option("--aim CAMERA X Y", "where the target shall come"),
     one_of(
         option("--range M", "the distance of what the pixel shows"),
@@ -86,10 +89,17 @@ def _check_target(args: argparse.Namespace) -> None:
     """Refuse options that do not go together, before any daemon gets a request. Raises WrongUse."""
     if (args.camera is None) != (args.at is None):
         raise WrongUse("--camera and --at go together")
+    panorama = getattr(args, "panorama", None) is not None
+    if (args.pixel is not None and len(args.pixel) != (2 if panorama else 4)) or (
+        panorama and args.pixel is None
+    ):
+        raise WrongUse("--pixel CAMERA FRAME_ID X Y is expected, or --panorama FOLDER --pixel X Y")
+    if not panorama and (getattr(args, "recompute", False) or getattr(args, "by_direction", False)):
+        raise WrongUse("--recompute and --by-direction go with --panorama")
     if args.frame is not None and args.position is None:
         raise WrongUse("--frame goes with --position")
     far = any(getattr(args, name, None) is not None for name in ("range", "ground", "plane"))
-    if far and args.pixel is None and args.camera is None:
+    if far and (panorama or (args.pixel is None and args.camera is None)):
         raise WrongUse("--range, --ground and --plane go with --pixel or --camera")
     if getattr(args, "seconds", None) is not None and args.rates is None:
         raise WrongUse("--seconds goes with --rates")
@@ -97,6 +107,13 @@ def _check_target(args: argparse.Namespace) -> None:
 
 def _target(args: argparse.Namespace, client: Client) -> dict[str, Any]:
     """The target as `Client.point` and `Client.start_track` take it; empty if the options name none."""
+    if getattr(args, "panorama", None) is not None:
+        from mastctl.panorama.folder import Folder
+
+        x, y = _pixel("--pixel", args.pixel)
+        target = {"id": Folder(args.panorama).index.id, "x_px": x, "y_px": y}
+        given = {name: True for name in ("recompute", "by_direction") if getattr(args, name)}
+        return {"panorama": target | given}
     if args.pixel is not None:
         camera, frame_id, *pixel = args.pixel
         return {"pixel": (camera, frame_id, *_pixel("--pixel", pixel))}

@@ -28,6 +28,7 @@ from mastctl.client.following import PASSING, followed
 from mastctl.client.jog import ANSWER_S, Jog
 from mastctl.client.keeping_calls import KeepingCalls
 from mastctl.client.lease import LeaseCalls
+from mastctl.client.panorama_calls import PanoramaCalls
 from mastctl.client.simulation_calls import SimulationCalls
 from mastctl.client.snapshot import Snapshot, read_snapshot
 
@@ -39,7 +40,7 @@ STOP_ANSWER_S = 5.0  # the daemon answers a stop within 3 s
 DEFAULT_URL = "http://127.0.0.1:8420"
 
 
-class Client(LeaseCalls, KeepingCalls, SimulationCalls):
+class Client(LeaseCalls, KeepingCalls, PanoramaCalls, SimulationCalls):
     """A connection to one daemon. A context manager; usable from one thread at a time.
 
     Parameters
@@ -90,6 +91,7 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         pixel: tuple[str, str, float, float] | None = None,
         position_m: Sequence[float] | None = None,
         frame: Literal["rover", "site"] | None = None,
+        panorama: Mapping[str, Any] | None = None,
         pan_rad: float | None = None,
         tilt_rad: float | None = None,
         aim: tuple[str, float, float] | None = None,
@@ -107,6 +109,8 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
             (camera, frame id, x, y), pixels; or
         position_m, frame
             a point, metres, in the ``rover`` (default) or ``site`` frame; or
+        panorama
+            a panorama's pixel: ``id``, ``x_px``, ``y_px``, perhaps ``recompute``, ``by_direction``; or
         pan_rad, tilt_rad
             joint angles.
         aim
@@ -125,6 +129,7 @@ class Client(LeaseCalls, KeepingCalls, SimulationCalls):
         """
         body = given(
             **_target(pixel, position_m, frame, aim, range_m, plane),
+            panorama=None if panorama is None else dict(panorama),
             pan_rad=pan_rad,
             tilt_rad=tilt_rad,
             pointings=pointings,

@@ -78,6 +78,9 @@ RECORD_STOP = Command("record.stop")
 RECORD_DELETE = Command("record.delete", "admin")  # of a fault, the evidence
 PLACE_KEEP = Command("place.keep")
 PLACE_FORGET = Command("place.forget")
+TARGET_KEEP = Command("target.keep")
+TARGET_FORGET = Command("target.forget")
+PANORAMA = Command("panorama", steers=True, need="motion")
 BENCH = Command("bench", steers=True, need="track")
 BENCH_STANDS = Command("bench.stands")  # a fact about the board
 BENCH_LEAVE = Command("bench.leave")

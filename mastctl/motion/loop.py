@@ -48,6 +48,10 @@ from mastctl.motion.steps import FoundAgain, Steps
 log = logging.getLogger(__name__)
 
 NO_PICTURE_OF_A_POSITION = "no residual: a position has no picture that could be looked for"
+CHANGED = (
+    ". The scene or the rover has changed since the panorama: take another, or point by direction alone "
+    "(by_direction)"
+)
 NO_TARGET = "no residual: joint angles name no target; no picture was taken"
 NOT_MEASURED: dict[str, Any] = {
     "camera": "", "frame_id": "", "aim_px": None, "predicted_px": None, "target_px": None,
@@ -69,17 +73,22 @@ class PointingLoop(Steps):
         super().__init__(*parts)
         self._pointings: list[Pointing] = []
 
-    def run(self, request: PointRequest) -> PointingResult:
+    def run(self, request: PointRequest, view_rad: Pair | None = None) -> PointingResult:
         """Carry out the request; blocks until it is done, at most the sum of its deadlines.
 
-        Raises PointingError with the step and the pointings done before; the mast was stopped.
+        ``view_rad``: true angles at which the clicked picture of a panorama was taken; the head goes there
+        first. Raises PointingError with the step and the pointings done before; the mast was stopped.
         """
         try:
+            if view_rad is not None and request.pixel is not None:
+                self._return_to(view_rad, request.pixel.camera)
             self._run(request)
         except BaseException as error:
             self._stop()
             if isinstance(error, (MastctlError, DriverError, CalibError)):
                 code, message = getattr(error, "code", "failed"), " ".join(str(error).split())
+                if view_rad is not None and self.last == "target":
+                    message += CHANGED
                 raise PointingError(code, message, self.last, self._so_far()) from error
             raise
         result = self._so_far()
@@ -107,28 +116,36 @@ class PointingLoop(Steps):
         else:
             found, partnered, point = self._in_stereo(target)
             assert found.other is not None
-            along = point.position_m - found.now.camera.ray(found.pixel_px).origins_m
-            along /= np.linalg.norm(along)
-            about = {
-                "other_camera": found.other.frame.camera,
-                "other_frame_id": found.other.frame.frame_id,
-                "other_pixel_px": partnered.match.pixel_px,
-                "other_sigma_px": partnered.match.sigma_px,
-                "correlation": partnered.match.correlation,
-                "second": partnered.match.second,
-                "across_px": partnered.across_px,
-                "sigma_m": np.sqrt(np.diag(point.covariance_m2)),
-                "range_m": point.ranges_m[0],
-                "range_sigma_m": math.sqrt(float(along @ point.covariance_m2 @ along)),
-                "range_from": "stereo",
-            }
+            about = _stereo_facts(found.now, found.pixel_px, found.other, partnered, point)
+        return self._previewed(found.now, found.pixel_px, about, aim)
+
+    def preview_kept(
+        self, request: PointRequest, frames: Sequence[StampedFrame], pixel_px: FloatArray, point_m: FloatArray
+    ) -> Preview:
+        """Return the same of a pixel of a kept picture, with the partner's of that moment, if there is one.
+
+        ``point_m`` (3,): where the thing lies if nothing measures it. Raises as `preview`.
+        """
+        now, *others = (self.cameras.view(frame) for frame in frames)
+        aim, about = aim_of(request, self._rig), {}
+        if others:
+            partnered = self.cameras.stereo(now, pixel_px, others[0])
+            point = self._triangulate(now, pixel_px, others[0], partnered.match)
+            about = _stereo_facts(now, pixel_px, others[0], partnered, point)
+        else:
+            self._position_m = point_m
+            range_m = float(np.linalg.norm(point_m - now.camera.C))
+            about = {"range_m": range_m, "range_from": "surface"}
+        return self._previewed(now, pixel_px, about, aim)
+
+    def _previewed(self, now: CameraView, pixel_px: FloatArray, about: dict[str, Any], aim: Aim) -> Preview:
         goal, refused = self._goal_of(aim)
         answer = {
             **dict.fromkeys(Preview.__annotations__),
             **about,
-            "camera": found.now.frame.camera,
-            "frame_id": found.now.frame.frame_id,
-            "pixel_px": found.pixel_px,
+            "camera": now.frame.camera,
+            "frame_id": now.frame.frame_id,
+            "pixel_px": pixel_px,
             "position_m": self._position_m,
             "aim": aim,
             "goal_rad": goal,
@@ -148,6 +165,15 @@ class PointingLoop(Steps):
             message = " ".join(str(error).split())
             return goal, {"code": getattr(error, "code", "failed"), "message": message}
         return goal, None
+
+    def _return_to(self, view_rad: Pair, camera: str) -> None:
+        """Go to where a kept picture was taken, so that a fresh one shows the same."""
+        with self.whole("view") as detail:
+            detail.update(true_pan_rad=view_rad[0], true_tilt_rad=view_rad[1])
+            self.rest()
+            self.before((camera,), view_rad)
+            _, settled = self.go_to_true(*view_rad)
+            self.capture((camera,), settled)
 
     def _run(self, request: PointRequest) -> None:
         if request.angles_rad is not None:
@@ -368,6 +394,28 @@ class PointingLoop(Steps):
             self._devices.stop()
         except Exception as error:
             log.error("the head did not confirm the stop: %s: %s", type(error).__name__, error)
+
+
+def _stereo_facts(
+    now: CameraView, pixel_px: FloatArray, other: CameraView, partnered: StereoMatch, point: Triangulation
+) -> dict[str, Any]:
+    """What a pair says of a pixel, for a preview."""
+    along = point.position_m - now.camera.ray(pixel_px).origins_m
+    along /= np.linalg.norm(along)
+    return {
+        "other_camera": other.frame.camera,
+        "other_frame_id": other.frame.frame_id,
+        "other_pixel_px": partnered.match.pixel_px,
+        "other_sigma_px": partnered.match.sigma_px,
+        "correlation": partnered.match.correlation,
+        "second": partnered.match.second,
+        "across_px": partnered.across_px,
+        "sigma_m": np.sqrt(np.diag(point.covariance_m2)),
+        "covariance_m2": point.covariance_m2,
+        "range_m": point.ranges_m[0],
+        "range_sigma_m": math.sqrt(float(along @ point.covariance_m2 @ along)),
+        "range_from": "stereo",
+    }
 
 
 def _facts(solution: Solution) -> dict[str, float]:

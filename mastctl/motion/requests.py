@@ -72,6 +72,21 @@ class PixelTarget:
 
 
 @dataclass(frozen=True, config=CHECKED)
+class PanoramaTarget:
+    """What a pixel of a panorama shows.
+
+    ``recompute``: evaluate a panorama of another mast file through its angles as read; ``by_direction``:
+    point where the panorama's surface puts it, with nothing found again in a picture.
+    """
+
+    id: Name
+    x_px: Pixel
+    y_px: Pixel
+    recompute: bool = False
+    by_direction: bool = False
+
+
+@dataclass(frozen=True, config=CHECKED)
 class PlaneTarget:
     """A plane of the rover frame in which a clicked thing lies: a point (3,), metres, and its normal (3,).
 
@@ -124,7 +139,7 @@ class TrackRequest(StrictBody):
 
 
 class PointRequest(TrackRequest):
-    """``POST /point``: exactly one of pixel, position_m, or pan_rad with tilt_rad.
+    """``POST /point``: exactly one of pixel, panorama, position_m, or pan_rad with tilt_rad.
 
     ``aim`` is where the target is wanted; by default the image centre of the clicked camera if it is on the
     head, else of the first stereo pair's left camera on the head. A second of the ``pointings`` uses what the
@@ -132,6 +147,7 @@ class PointRequest(TrackRequest):
     which it lies: then no other camera is needed. Without them a pair measures it, or it is not known.
     """
 
+    panorama: PanoramaTarget | None = None
     pan_rad: Angle | None = None
     tilt_rad: Angle | None = None
     aim: Aim | None = None
@@ -142,10 +158,12 @@ class PointRequest(TrackRequest):
     def _check_targets(self) -> None:
         """Pass exactly one target, and what goes with it. Raises ValueError."""
         angles = (self.pan_rad is not None) + (self.tilt_rad is not None)
-        targets = (self.pixel is not None) + (self.position_m is not None) + (angles > 0)
+        clicked = (self.pixel is not None) + (self.panorama is not None)
+        targets = clicked + (self.position_m is not None) + (angles > 0)
         if targets != 1:
             raise ValueError(
-                f"{targets} targets where exactly one of pixel, position_m, pan_rad with tilt_rad is expected"
+                f"{targets} targets where exactly one of pixel, panorama, position_m, pan_rad with tilt_rad "
+                "is expected"
             )
         if angles == 1:
             missing = "tilt_rad" if self.tilt_rad is None else "pan_rad"
@@ -157,8 +175,8 @@ class PointRequest(TrackRequest):
                 raise ValueError(f"{name} goes with pixel only")
         if self.range_m is not None and self.plane is not None:
             raise ValueError("range_m and plane both say how far it is; one of them is expected")
-        if self.pointings == 2 and self.pixel is None:
-            raise ValueError("pointings is 2, which goes with pixel only: nothing else can be measured again")
+        if self.pointings == 2 and not clicked:
+            raise ValueError("pointings is 2, which goes with a pixel only: nothing else is measured again")
 
     @property
     def angles_rad(self) -> tuple[float, float] | None:
@@ -168,7 +186,7 @@ class PointRequest(TrackRequest):
     @property
     def captures(self) -> int:
         """How often it goes somewhere and takes images there."""
-        return 0 if self.angles_rad is not None else self.pointings
+        return 0 if self.angles_rad is not None else self.pointings + (self.panorama is not None)
 
 
 def aim_of(request: PointRequest, rig: Rig) -> Aim:

@@ -115,6 +115,16 @@ class Steps:
             one["duration_s"] = self._clock.now_s() - began_s
             self._record(one)
 
+    @contextmanager
+    def whole(self, name: str) -> Iterator[dict[str, Any]]:
+        """Record what happens inside as one step, without the steps that it is made of."""
+        with self.step(name) as detail:
+            record, self._record = self._record, lambda part: None
+            try:
+                yield detail
+            finally:
+                self._record, self.last = record, name
+
     def check_not_stopped(self) -> None:
         """Pass unless the request was cancelled. Raises PointingError ``stopped``."""
         if self._cancelled.is_set():

@@ -15,12 +15,14 @@ from dataclasses import asdict
 from importlib.metadata import version
 from typing import Any
 
+import numpy as np
+
 from calib.files.mast_file import StoredRig
 from calib.matching.handoff import MatchedHandoff
 from drivers.clock import Clock, SystemClock
 from drivers.hardware import Hardware, clock_for, head_name
 from drivers.simulation_clock import SimulationClock
-from mastctl.answers import CalibrationTold, CameraTold, MeasuredJoints, Status, TrackTold
+from mastctl.answers import CalibrationTold, CameraTold, KeptTarget, MeasuredJoints, Status, TrackTold
 from mastctl.as_json import as_json
 from mastctl.bench.operation import BenchOperation
 from mastctl.config import Config
@@ -39,6 +41,7 @@ from mastctl.motion.jog import Jogs
 from mastctl.motion.requests import wrong_camera
 from mastctl.motion.search import in_picture
 from mastctl.motion.track import ACTIVE, RoverPose, Tracker, TrackStatus
+from mastctl.panorama.panoramas import Panoramas
 from mastctl.recorder.entries import AttachedMast
 from mastctl.recorder.recorder import Recorder
 from mastctl.recorder.writer import Attached
@@ -47,6 +50,7 @@ from mastctl.safety.latch import Latch
 from mastctl.safety.state_folder import StateFolder, other_head_folders
 from mastctl.safety.stop_socket import StopSocket
 from mastctl.service.masts import MastInUse, Masts, configured, read_mast
+from mastctl.service.places import places, targets
 from mastctl.service.steering import Steering
 from mastctl.service.stopping import SocketStops, Stopping, StopThreads, state_faults
 from mastctl.service_manager import ServiceManager
@@ -91,6 +95,7 @@ class Service:
         self.started_s = clock.now_s()
         self._version = version("mastctl")
         self.folder = folder
+        self.places, self.targets = places(self.folder.path), targets(self.folder.path)
         self.head_folder = head
         beside = other_head_folders(head_name(config.hardware), head)
         self.latch = Latch(folder, others=beside) if head is None else Latch(head, folder, beside)
@@ -176,6 +181,14 @@ class Service:
         )
         self.stopping = Stopping(self.devices, self.operations, self.tracker, machine, self.latch)
         self.masts = Masts(config, mast, self.devices, self.operations, machine, self._use_mast)
+        self.panoramas = Panoramas(
+            self.folder.path,
+            self.masts.unchanged,
+            lambda: self.steering.rig,
+            self.devices,
+            clock,
+            self.operations,
+        )
         self.steering = Steering(
             self.masts,
             rig,
@@ -184,6 +197,7 @@ class Service:
             self.operations,
             self.tracker,
             self.health,
+            self.panoramas,
             config.repeat_after_s,
         )
         self.jogs = Jogs(
@@ -267,13 +281,45 @@ class Service:
         return published_value(topic, value, self.clock.now_s())
 
     def mast_verdict(self) -> CalibrationTold:
-        """Return whether the mast file still holds, by all three kinds of evidence."""
-        return mast_verdict(self.health.verdict, self.sentinel.summary(), self.handoffs.summary())
+        """Return whether the mast file still holds, by all kinds of evidence."""
+        looks, handoffs = self.sentinel.summary(), self.handoffs.summary()
+        slip = self.panoramas.slip(self.stored.digest)
+        return mast_verdict(self.health.verdict, looks, handoffs, slip)
 
     def track_answer(self, status: TrackStatus | None = None) -> TrackTold:
         """Return the track, as it is or was, and the self-check of now as ``GET /track`` tells them."""
         track = (status or self.tracker.status).as_json(self.clock.now_s())
         return {**track, "self_check": self.handoffs.summary()}
+
+    def keep_target(
+        self, name: str, position_m: list[float], frame: str, covariance_m2: list[list[float]] | None
+    ) -> dict[str, KeptTarget]:
+        """Keep a target by a name and return all; in the site frame, if a pose is known."""
+        pose = self.tracker.pose
+        if frame == "rover" and pose is not None:
+            frame, turned = "site", pose.site_from_rover
+            position_m = turned.points(np.array(position_m)).tolist()
+            if covariance_m2 is not None:
+                covariance_m2 = (turned.rotation @ np.array(covariance_m2) @ turned.rotation.T).tolist()
+        one = {"position_m": position_m, "frame": frame, "covariance_m2": covariance_m2}
+        return self.targets.keep(name, one)
+
+    def targets_in(self, frame: StampedFrame) -> dict[str, dict[str, float]]:
+        """Return where a frame shows the kept targets, by name, as `track_in` has one."""
+        if frame.mast_digest != self.stored.digest:
+            return {}
+        camera, pose = self.stored.rig.camera_in_rover(frame.camera, *frame.true_rad), self.tracker.pose
+        shown: dict[str, dict[str, float]] = {}
+        for name, one in self.targets.known.items():
+            position, covariance = np.array(one["position_m"]), one["covariance_m2"]
+            if one["frame"] == "site" and pose is not None:
+                here = pose.site_from_rover.inverse
+                position = here.points(position)
+                if covariance is not None:
+                    covariance = here.rotation @ np.array(covariance) @ here.rotation.T
+            if (place := in_picture(camera, position, covariance)) is not None:
+                shown[name] = place
+        return shown
 
     def track_in(self, frame: StampedFrame) -> dict[str, float] | None:
         """Return where a frame should show the track's target, pixels, with one sigma as an ellipse.

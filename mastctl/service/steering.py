@@ -27,6 +27,7 @@ from mastctl.motion.requests import (
 )
 from mastctl.motion.settings import PointingSettings
 from mastctl.motion.track import ACTIVE, RoverPose, Tracker
+from mastctl.panorama.panoramas import Panoramas
 from mastctl.service.masts import Masts
 from mastctl.watch.residuals import CalibrationHealth
 
@@ -65,8 +66,10 @@ class Steering:
         operations: OperationRunner,
         tracker: Tracker,
         health: CalibrationHealth,
+        panoramas: Panoramas,
         repeat_after_s: float | None = None,
     ) -> None:
+        self._panoramas = panoramas
         self._masts = masts
         self._devices = devices
         self._clock = clock
@@ -77,7 +80,7 @@ class Steering:
 
     def use_rig(self, rig: Rig, repeat_after_s: float | None) -> None:
         """Point by another mast file, and by these settings, from now on."""
-        self._rig = rig
+        self.rig = rig
         self._settings = PointingSettings()
         if repeat_after_s is not None:
             self._settings = replace(self._settings, repeat_after_s=repeat_after_s)
@@ -90,13 +93,17 @@ class Steering:
         `mastctl.control.operations.OperationRunner.start`.
         """
         with self._masts.unchanged() as mast:
+            view_rad = None
+            if request.panorama is not None:
+                request, view_rad = self._panoramas.pointed(request, mast)
+                recorded = recorded if request.pixel is None else {**recorded, "pixel": request.pixel}
             request = self._in_rover(request)
-            self._check(request)
+            self._check(request, None if view_rad else CLICK_AGE_S)
             loop = self._loop()
 
             def run(record: Callable[[Any], None], cancelled: threading.Event) -> Any:
                 with self._devices.exposure_held():
-                    return loop(record, cancelled).run(request)
+                    return loop(record, cancelled).run(request, view_rad)
 
             return self._operations.start(recorded, run, partial(self._health.ended, mast.stored))
 
@@ -105,10 +112,16 @@ class Steering:
 
         Raises as `point` and `mastctl.motion.loop.PointingLoop.preview`.
         """
-        with self._masts.unchanged():
-            self._check(request)
-            loop = self._loop()
-        return loop(lambda step: None, cancelled).preview(request)
+        with self._masts.unchanged() as mast:
+            target = request.panorama
+            if target is not None:
+                seen, frames = self._panoramas.kept_views(target, mast)
+                request, _ = self._panoramas.pointed(request, mast)
+            self._check(request, CLICK_AGE_S if target is None else None)
+            loop = self._loop()(lambda step: None, cancelled)
+        if target is not None:
+            return loop.preview_kept(request, frames, seen.pixel_px, seen.point_m)
+        return loop.preview(request)
 
     def start_track(self, request: TrackRequest, recorded: Mapping[str, Any]) -> Operation:
         """Begin to follow what a pixel shows, or what is seen at a position; return the start's record.
@@ -118,8 +131,8 @@ class Steering:
         with self._masts.unchanged():
             request = self._in_rover(request)
             if request.pixel is not None:
-                check_known(request.pixel.camera, self._rig.cameras)
-                check_pair(request.pixel.camera, self._rig, self._masts.in_use.stored.rig)
+                check_known(request.pixel.camera, self.rig.cameras)
+                check_pair(request.pixel.camera, self.rig, self._masts.in_use.stored.rig)
                 self._check_pixel(request.pixel)
             return self._tracker.start(request, recorded)
 
@@ -153,21 +166,21 @@ class Steering:
     def _loop(self) -> Callable[[Callable[[Any], None], threading.Event], PointingLoop]:
         """Return what makes a pointing by the mast file and the limits of now."""
         limits = self._devices.judge.limits
-        return partial(PointingLoop, self._rig, self._devices, limits, self._clock, self._settings)
+        return partial(PointingLoop, self.rig, self._devices, limits, self._clock, self._settings)
 
     def _in_rover(self, request: R) -> R:
         """Return a request in the rover frame of now; before a pose, site and rover are one."""
         pose = self._tracker.pose
         return request if pose is None else request.in_rover(pose.site_from_rover)
 
-    def _check(self, request: PointRequest) -> None:
-        """Refuse a request that does not fit the mast file in use; see `point`."""
-        if request.pixel is not None:
+    def _check(self, request: PointRequest, max_age_s: float | None = CLICK_AGE_S) -> None:
+        """Refuse a request that does not fit the mast file in use; see `point`. None: of a panorama."""
+        if request.pixel is not None and max_age_s is not None:
             self._check_pixel(request.pixel)
         if request.angles_rad is not None:
             self._devices.judge.check_goal(*request.angles_rad)
         if request.aim is not None:
-            aim_of(request, self._rig)
+            aim_of(request, self.rig)
 
     def _check_pixel(self, target: PixelTarget) -> None:
         stored = self._masts.in_use.stored
@@ -178,7 +191,7 @@ class Steering:
             )
             raise NotNow("other_mast_file", message)
         find = partial(self._devices.frame_by_id, max_age_s=CLICK_AGE_S)
-        frame = clicked_frame(target, self._rig, find)
+        frame = clicked_frame(target, self.rig, find)
         self._devices.hold(frame)  # until it has been found again, however many images are watched
         moved_s = self._tracker.moved_s
         if moved_s is not None and frame.exposure_began_s < moved_s:

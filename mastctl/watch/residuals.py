@@ -215,12 +215,13 @@ def _what_drifts(evidence: Evidence, since: str) -> str:
 
 
 def mast_verdict(
-    residuals: ResidualVerdict, looks: SentinelTold | None, handoffs: SelfCheck
+    residuals: ResidualVerdict, looks: SentinelTold | None, handoffs: SelfCheck, panorama: str
 ) -> CalibrationTold:
     """Return the verdict as ``GET /status`` has it under ``calibration``.
 
-    ``drifts`` if any of the three says so, else that of the residuals; ``sentence``: of each that speaks
-    against the mast file; ``since``: when the first of these began, where one says.
+    ``panorama``: what the seams of the last one say, empty for nothing. ``drifts`` if any of these says so,
+    else that of the residuals; ``sentence``: of each that speaks against the mast file; ``since``: when the
+    first of these began, where one says.
     """
     against: list[tuple[str, str | None]] = []
     if residuals["verdict"] == "drifts":
@@ -228,6 +229,7 @@ def mast_verdict(
     if looks is not None and looks["level"] == "bad":
         against.append((f"reference pictures: {looks['sentence']}", looks["since"]))
     against += [(f"hand-offs: {one['sentence']}", None) for one in handoffs["offsets"]]
+    against += [(f"panorama: {panorama}", None)] if panorama else []
     return {
         "verdict": "drifts" if against else residuals["verdict"],
         "sentence": "; ".join(reason for reason, _ in against) or residuals["sentence"],

@@ -25,6 +25,7 @@ from mastctl.web.events import add_events
 from mastctl.web.images import add_cameras, add_images
 from mastctl.web.keeping import add_bench, add_masts, add_places, add_recordings
 from mastctl.web.page import add_page, add_site, text_answer
+from mastctl.web.panorama import add_panoramas, add_targets
 from mastctl.web.parts import Here, Parts
 from mastctl.web.sessions import add_sessions
 from mastctl.web.simulation import add_simulation
@@ -92,7 +93,7 @@ def api() -> FastAPI:
     for add in (
         *(add_sessions, add_pointing, add_estop, add_lease, add_tracking, add_limits, add_masts, add_places),
         *(add_recordings, add_bench, add_simulation, add_watching, add_events, add_images, add_page),
-        *(add_cameras, add_site),
+        *(add_cameras, add_panoramas, add_targets, add_site),
     ):
         add(app)
 

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import threading
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Path, Request
 from fastapi.responses import FileResponse, Response
 
-from calib.errors import BadFile
-from calib.files.records import read_value
 from mastctl.answers import (
     BenchAnswer,
     BenchRuns,
-    HeadPlace,
     MastChange,
     PlaceList,
     RecorderState,
@@ -40,28 +36,19 @@ from mastctl.control.entry import (
     RECORD_STOP,
     RELOAD,
 )
-from mastctl.errors import BadRequest, NotKnown, Unable
 from mastctl.http import PREFIX
-from mastctl.safety.state_folder import StateFile
 from mastctl.service.masts import MastInUse, Masts
 from mastctl.service.reload import reload
 from mastctl.web.commands import Asks, command
 from mastctl.web.described import file_of
 from mastctl.web.models import BenchBody, MastBody, PlaceBody, RecordBody
-from mastctl.web.parts import Here, Parts
+from mastctl.web.parts import Here
 
 REPORT = (
     "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'none'"
 )
 """The Content-Security-Policy of a report: its own styles and drawings, no script, an origin of nobody's."""
-PLACES_FILE = "places.json"
-PLACES_SCHEMA = "mastctl/places/1"
-HOME = "home"
-AT_HOME: HeadPlace = {"pan_rad": 0.0, "tilt_rad": 0.0}
-"""Home, until another one is kept."""
-MOST_PLACES = 50
-_WRITING_PLACES = threading.Lock()
 PlaceName = Annotated[
     str,
     Path(
@@ -125,54 +112,15 @@ def add_places(app: FastAPI) -> None:
 
     @app.get(f"{PREFIX}/places", summary="The places of the head that are kept by a name")
     async def places(here: Here) -> PlaceList:
-        return await here.waiting.run(lambda: _listed(_places(here)))
+        return {"places": await here.waiting.run(here.service.places.all)}
 
     @command(app, "POST /places/{name}", PLACE_KEEP, "Keep a place by a name")
     def keep(name: PlaceName, body: PlaceBody, here: Here) -> PlaceList:
-        with _WRITING_PLACES:
-            kept = _places(here)
-            if name not in kept and len(kept) >= MOST_PLACES:
-                message = f"{MOST_PLACES} places are kept already; forget one of them first"
-                raise BadRequest("too_many_places", message)
-            return _keep_places(here, {**kept, name: {"pan_rad": body.pan_rad, "tilt_rad": body.tilt_rad}})
+        return {"places": here.service.places.keep(name, body.model_dump())}
 
     @command(app, "DELETE /places/{name}", PLACE_FORGET, "Forget a place; a forgotten home is 0, 0 again")
     def forget(name: PlaceName, here: Here) -> PlaceList:
-        with _WRITING_PLACES:
-            kept = _places(here)
-            if name not in kept:
-                raise NotKnown("place_unknown", f"no place is kept by the name {name!r}")
-            return _keep_places(here, {one: place for one, place in kept.items() if one != name})
-
-
-def _places_file(here: Parts) -> StateFile:
-    return StateFile(here.service.folder.path / PLACES_FILE, PLACES_SCHEMA)
-
-
-def _places(here: Parts) -> dict[str, HeadPlace]:
-    """The places as the disk has them. Raises Unable ``unreadable``."""
-    file = _places_file(here)
-    try:
-        kept = (file.read() or {}).get("places", {})
-        places: dict[str, HeadPlace] = read_value(dict[str, HeadPlace], kept, file.path, "places")
-    except BadFile as error:
-        raise Unable("unreadable", str(error)) from None
-    return places
-
-
-def _keep_places(here: Parts, places: dict[str, HeadPlace]) -> PlaceList:
-    """Write the places; return them. Raises Unable ``not_saved``."""
-    try:
-        _places_file(here).write({"places": places})
-    except BadFile as error:
-        raise Unable("not_saved", str(error)) from None
-    return _listed(places)
-
-
-def _listed(places: dict[str, HeadPlace]) -> PlaceList:
-    """Home first, the others by their names."""
-    others = {name: places[name] for name in sorted(places) if name != HOME}
-    return {"places": {HOME: places.get(HOME, AT_HOME), **others}}
+        return {"places": here.service.places.forget(name)}
 
 
 def add_recordings(app: FastAPI) -> None:

@@ -280,6 +280,38 @@ class BenchBody(StrictBody):
         return self
 
 
+class PanoramaBody(StrictBody):
+    """``POST /panoramas``: which field, azimuth and elevation, by which cameras; or what to go on with.
+
+    By default the widest stereo pair, all that the limits let it see, 0.7 rad down to 0.2 rad up.
+    ``exposure``: fixed from the first view on, or each view's own.
+    """
+
+    pair: Name | None = None
+    camera: Name | None = None
+    pan_rad: Annotated[list[Angle], Field(min_length=2, max_length=2)] | None = None
+    tilt_rad: Annotated[list[Angle], Field(min_length=2, max_length=2)] | None = None
+    overlap: Annotated[float, Field(ge=0.05, le=0.8)] = 0.2
+    exposure: Literal["first", "auto-per-view"] = "first"
+    resume: Name | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        if self.pair is not None and self.camera is not None:
+            raise ValueError("pair and camera are both there, one of them is expected")
+        if self.resume is not None and self.model_fields_set - {"resume", "deadline_s"}:
+            raise ValueError("resume goes alone: a panorama goes on as it was begun")
+        return self
+
+
+class TargetBody(StrictBody):
+    """``POST /targets/{name}``: a point of the rover or site frame, and its covariance if it is known."""
+
+    position_m: Place
+    frame: Literal["rover", "site"] = "rover"
+    covariance_m2: Annotated[list[Place], Field(min_length=3, max_length=3)] | None = None
+
+
 class FaultBody(StrictBody):
     """``POST /simulation/faults``: a fault word for a simulated device, with its parameters."""
 

@@ -94,13 +94,16 @@ def add_pointing(app: FastAPI) -> None:
     @app.post(f"{PREFIX}/point/preview", summary="The point at a pixel, before anything moves")
     async def preview(body: PointRequest, here: Here) -> Preview:
         service = here.service
-        if body.pixel is None:
-            raise BadRequest("bad_request", "pixel is missing; a preview is of a pixel of a named frame")
-        service.check_camera(body.pixel.camera)
+        if body.pixel is None and body.panorama is None:
+            raise BadRequest(
+                "bad_request", "pixel is missing; a preview is of a named frame's or a panorama's"
+            )
+        camera = service.panoramas.camera_of(body.panorama) if body.pixel is None else body.pixel.camera
+        service.check_camera(camera)
         cancelled = threading.Event()
         try:
             seen: Preview = await here.waiting.image(
-                body.pixel.camera, lambda: service.steering.preview(body, cancelled)
+                camera, lambda: service.steering.preview(body, cancelled)
             )
         except PointingError as error:
             kind = NotNow if error.code in ("head_moving", "stopped") else BadRequest

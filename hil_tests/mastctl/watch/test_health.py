@@ -15,11 +15,12 @@ from drivers.interfaces import COARSE_COUNT_RAD
 from hil_tests.mastctl.service_fakes import fake_step
 from hil_tests.mastctl.watch.histories import NOON_S, bumped, pointing, stored_rig
 from hil_tests.waiting import until
+from mastctl.answers import ResidualVerdict
 from mastctl.control.operations import Operation
 from mastctl.watch import evidence
 from mastctl.watch.evidence import FILE, Measured, measured_by, measured_of, pointing_journal
 from mastctl.watch.journal import JournalThread
-from mastctl.watch.residuals import CalibrationHealth
+from mastctl.watch.residuals import CalibrationHealth, mast_verdict, residual_verdict
 
 STORED = stored_rig()
 
@@ -122,3 +123,41 @@ def test_a_mast_file_that_does_not_say_how_sure_it_is_is_not_judged_by(tmp_path:
     assert health.verdict["verdict"] == "unknown"
     assert "fit.covariance" in health.verdict["sentence"]
     assert len(pointing_journal(tmp_path).read()) == 1
+
+
+NOTHING_YET = residual_verdict("few", "few pointings")
+DRIFTS = residual_verdict("drifts", "navcam_left looks 2 mrad beside", 9, "2026-05-02T00:00:00+00:00")
+SLIPPED = {"level": "bad", "sentence": "pan slipped by 4 mrad", "since": "2026-05-01T00:00:00+00:00"}
+OFFSET = {"sentence": "hazcam_left sees targets 2 px right"}
+
+
+@pytest.mark.parametrize(
+    ("residuals", "looks", "offsets", "verdict", "sentence", "since"),
+    [
+        (NOTHING_YET, None, [], "few", NOTHING_YET["sentence"], None),
+        (NOTHING_YET, {**SLIPPED, "level": "unsure"}, [], "few", NOTHING_YET["sentence"], None),
+        (DRIFTS, None, [], "drifts", DRIFTS["sentence"], DRIFTS["since"]),
+        (NOTHING_YET, SLIPPED, [], "drifts", f"reference pictures: {SLIPPED['sentence']}", SLIPPED["since"]),
+        (NOTHING_YET, None, [OFFSET], "drifts", f"hand-offs: {OFFSET['sentence']}", None),
+        (
+            DRIFTS, SLIPPED, [OFFSET], "drifts",
+            f"{DRIFTS['sentence']}; reference pictures: {SLIPPED['sentence']}; "
+            f"hand-offs: {OFFSET['sentence']}",
+            SLIPPED["since"],
+        ),
+    ],
+)  # fmt: skip
+def test_the_mast_file_holds_as_long_as_nothing_speaks_against_it(
+    residuals: ResidualVerdict, looks: Any, offsets: Any, verdict: str, sentence: str, since: str | None
+) -> None:
+    found = mast_verdict(residuals, looks, {"handoffs": 3, "offsets": offsets}, "")
+    assert found == {
+        "verdict": verdict, "sentence": sentence, "pointings": residuals["pointings"], "since": since
+    }  # fmt: skip
+
+
+def test_a_panoramas_seams_speak_too() -> None:
+    found = mast_verdict(
+        NOTHING_YET, None, {"handoffs": 0, "offsets": []}, "tilt stood +1 mrad beside its reading"
+    )
+    assert found["verdict"] == "drifts" and found["sentence"].startswith("panorama: tilt stood")

@@ -10,9 +10,9 @@ import pytest
 from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, fake_daemon
 from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
-from mastctl.web.keeping import PLACES_FILE as FILE
 
 Pair = tuple[RunningDaemon, FakeHardware]
+FILE = "places.json"
 HOME = {"pan_rad": 0.0, "tilt_rad": 0.0}
 CHART = {"pan_rad": 0.5, "tilt_rad": -0.25}
 

@@ -1,0 +1,279 @@
+"""Panoramas of a daemon on the simulated rover: taken, gone on with, clicked, refused; and kept targets."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib.errors import BadFile
+from calib.files import replace_bytes
+from calib.files.mast_file import load_rig, save_rig
+from calib.geometry.rig import Rig
+from hil_tests.mastctl.motion.test_tracking_simulated import cropped
+from hil_tests.waiting import until
+from mastctl.cli.main import main
+from mastctl.client import Client, ClientError
+from mastctl.config import load_config
+from mastctl.daemon import RunningDaemon
+from mastctl.panorama.folder import Folder
+
+ROVER = """
+schema: mastctl/config/1
+mast_file: rig.yaml
+listen: {port: 0}
+pan_tilt: {driver: sim}
+cameras: {navcam_left: {driver: sim}, navcam_right: {driver: sim}}
+limits: {pan_rad: [-1.0, 1.0], tilt_rad: [-1.2, 0.5], speed_rad_per_s: 2.0}
+simulation: {rover: rig.yaml, samples: 1, seed: 3, speed: max, cameras: {rate_hz: 30}}
+state: {folder: state}
+"""
+FIELD: dict[str, Any] = {"pan_rad": (-0.45, 0.45), "tilt_rad": (-0.6, -0.25)}
+
+
+@pytest.fixture(scope="module")
+def rover(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The configuration of a rover whose Navcams have small pictures; its mast file is the true one."""
+    folder = tmp_path_factory.mktemp("rover")
+    rig = load_rig(repository / "configs/sim/rocky8.yaml").rig
+    cameras = {name: cropped(rig.cameras[name]) for name in rig.stereo["navcam"]}
+    small = Rig("small", rig.mast, cameras, {"navcam": rig.stereo["navcam"]})
+    save_rig(small, folder / "rig.yaml")
+    save_rig(replace(small, name="other"), folder / "other.yaml")
+    (folder / "rover.yaml").write_text(ROVER)
+    return folder / "rover.yaml"
+
+
+@pytest.fixture(scope="module")
+def daemon(rover: Path) -> Iterator[RunningDaemon]:
+    with RunningDaemon(load_config(rover)) as made:
+        yield made
+
+
+@pytest.fixture
+def client(daemon: RunningDaemon) -> Iterator[Client]:
+    with Client(daemon.url, name="bench") as made:
+        yield made
+        made.clear_faults()
+        made.stand(0.0, 0.0, 0.0)
+
+
+def taken(client: Client, **wanted: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+    record: Any = client.wait(client.take_panorama(**(wanted or FIELD)), 600.0)
+    return record, client.panorama(record["request"]["panorama"])
+
+
+@pytest.fixture(scope="module")
+def panorama(daemon: RunningDaemon) -> dict[str, Any]:
+    """One panorama for all tests that only read it."""
+    with Client(daemon.url, name="bench") as client:
+        record, index = taken(client)
+    assert record["state"] == "done", record["error"]
+    return index
+
+
+def pixel_of(index: dict[str, Any], x: float = 0.5, y: float = 0.5) -> dict[str, Any]:
+    width, height = index["mosaic"]["size_px"]
+    return {"id": index["id"], "x_px": x * (width - 1), "y_px": y * (height - 1)}
+
+
+def refused(code: str, act: Any) -> str:
+    with pytest.raises(ClientError) as refusal:
+        act()
+    assert refusal.value.code == code
+    return str(refusal.value)
+
+
+def test_views_cover_the_field_at_rest_with_evidence(panorama: dict[str, Any], rover: Path) -> None:
+    assert panorama["state"] == "done"
+    assert {view["state"] for view in panorama["views"]} == {"taken"}
+    for view in panorama["views"][1:]:
+        assert view["motion_evidence"]["navcam_left"]["verdict"] == "seen"
+    whole = panorama["whole"]
+    assert whole["count"] >= 10 and max(whole["rms_px"]) < 0.5
+    assert "slip" not in panorama
+    folder = Folder(rover.parent / "state" / "panoramas" / panorama["id"])
+    mosaic = folder.path / "mosaic.png"
+    assert mosaic.stat().st_size > 10_000 and (folder.path / "preview.jpg").is_file()
+    assert folder.mast.digest == panorama["mast_digest"]
+
+
+def test_a_clicked_pixel_is_pointed_at_and_measured(client: Client, panorama: dict[str, Any]) -> None:
+    target = pixel_of(panorama, 0.35, 0.4)
+    client.wait(client.point(pan_rad=0.9, tilt_rad=0.3))
+    seen: Any = client.daemon.json(dict, "POST", "/point/preview", json={"panorama": target})
+    assert seen["range_from"] == "stereo" and len(seen["covariance_m2"]) == 3
+    record: Any = client.wait(client.point(panorama=target), 300.0)
+    assert record["state"] == "done", record["error"]
+    assert np.abs(record["residual_px"]).max() < 0.3
+    np.testing.assert_allclose(record["position_m"], seen["position_m"], atol=0.05)
+    assert record["steps"][0]["name"] == "view"
+
+
+def test_a_scene_that_has_changed_is_said_and_direction_alone_is_offered(
+    client: Client, panorama: dict[str, Any]
+) -> None:
+    target = pixel_of(panorama, 0.6, 0.5)
+    client.stand(3.0, 2.0, 1.0)
+    record: Any = client.wait(client.point(panorama=target), 300.0)
+    assert record["state"] == "failed"
+    assert "The scene or the rover has changed since the panorama" in record["error"]["message"]
+    alone: Any = client.wait(client.point(panorama=target | {"by_direction": True}), 300.0)
+    assert alone["state"] == "done" and alone["residual_px"] is None
+    assert "no residual" in alone["pointings"][0]["note"]
+
+
+def test_a_pixel_beside_the_views_is_refused(client: Client, panorama: dict[str, Any]) -> None:
+    beside = {"id": panorama["id"], "x_px": -50.0, "y_px": 3.0}
+    assert "shows no view" in refused("outside_panorama", lambda: client.point(panorama=beside))
+    refused("panorama_unknown", lambda: client.point(panorama={"id": "none", "x_px": 1.0, "y_px": 1.0}))
+    for file in ("none.png", "%2e%2e/%2e%2e/audit.jsonl", "frames"):
+        with pytest.raises(ClientError, match=r"has no file|no path"):
+            client.panorama_file(panorama["id"], file)
+
+
+def test_another_mast_file_is_refused_by_name_or_recomputed(client: Client, panorama: dict[str, Any]) -> None:
+    client.use_mast("other.yaml")
+    try:
+        target = pixel_of(panorama, 0.35, 0.4)
+        assert "recompute" in refused("other_mast_file", lambda: client.point(panorama=target))
+        record: Any = client.wait(client.point(panorama=target | {"recompute": True}), 300.0)
+        assert record["state"] == "done", record["error"]
+        assert np.abs(record["residual_px"]).max() < 0.3
+    finally:
+        client.use_former_mast()
+
+
+def test_views_beyond_the_limits_are_left_out_and_listed(client: Client) -> None:
+    _, index = taken(client, pan_rad=(0.5, 1.6), tilt_rad=(-0.4, -0.3))
+    states = [view["state"] for view in index["views"]]
+    assert "taken" in states and "forbidden" in states
+    forbidden = next(view for view in index["views"] if view["state"] == "forbidden")
+    assert "pan" in forbidden["reason"] and "1" in forbidden["reason"]
+    assert index["state"] == "done"
+
+
+def test_a_stop_keeps_what_was_taken_and_resume_goes_on(client: Client) -> None:
+    operation = client.take_panorama(**FIELD)
+    name = str(client.operation(operation)["request"]["panorama"])
+    until(lambda: any(one["state"] == "taken" for one in client.panorama(name)["views"]), "a view")
+    client.stop()
+    record: Any = client.wait(operation, 60.0)
+    index = client.panorama(name)
+    assert (record["state"], index["state"]) == ("stopped", "ended")
+    before = {at: view["frames"] for at, view in enumerate(index["views"]) if view["state"] == "taken"}
+    assert before and len(before) < len(index["views"])
+    record, index = taken(client, resume=name)
+    assert record["state"] == "done" and index["state"] == "done"
+    assert all(view["state"] == "taken" for view in index["views"])
+    assert all(index["views"][at]["frames"] == frames for at, frames in before.items())
+
+
+def test_a_camera_that_is_gone_ends_it_and_nothing_is_lost(client: Client) -> None:
+    client.set_fault("navcam_left", "off")
+    record, index = taken(client)
+    assert record["state"] == "failed" and "navcam_left" in record["error"]["message"]
+    assert sum(view["state"] == "missing" for view in index["views"]) == 3
+    client.clear_faults()
+    record, index = taken(client, resume=index["id"])
+    assert record["state"] == "done" and all(view["state"] == "taken" for view in index["views"])
+
+
+def test_a_full_disk_ends_it_in_a_sentence(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = replace_bytes
+
+    def full(path: Path, data: bytes, mode: int = 0o600) -> None:
+        if path.name.startswith("002-"):
+            raise OSError(28, "No space left on device")
+        whole(path, data, mode)
+
+    monkeypatch.setattr("mastctl.panorama.folder.replace_bytes", full)
+    record, index = taken(client)
+    assert record["state"] == "failed" and "No space left on device" in record["error"]["message"]
+    assert [view["state"] for view in index["views"][:3]] == ["taken", "taken", "wanted"]
+    assert index["state"] == "ended" and "No space left on device" in index["reason"]
+
+
+def test_a_killed_daemons_panorama_goes_on_in_the_next(rover: Path, tmp_path: Path) -> None:
+    """A kill leaves the index of the last view, whose state is still running."""
+    config = replace(load_config(rover), state_folder=tmp_path / "state")
+    with RunningDaemon(config) as daemon, Client(daemon.url) as client:
+        _, index = taken(client)
+    path = tmp_path / "state" / "panoramas" / index["id"]
+    folder = Folder(path)
+    views = [
+        view if at < 2 else view.model_copy(update={"state": "wanted", "frames": {}})
+        for at, view in enumerate(folder.index.views)
+    ]
+    folder.save(folder.index.model_copy(update={"state": "running", "views": views, "mosaic": None}))
+    with RunningDaemon(config) as daemon, Client(daemon.url) as client:
+        record, index = taken(client, resume=index["id"])
+    assert record["state"] == "done" and all(view["state"] == "taken" for view in index["views"])
+
+
+def test_another_client_takes_the_lease_and_it_ends(client: Client, daemon: RunningDaemon) -> None:
+    granted = client.acquire_lease()
+    client.use_lease(granted["lease_id"])
+    operation = client.take_panorama(**FIELD)
+    name = str(client.operation(operation)["request"]["panorama"])
+    with Client(daemon.url, name="rover") as other:
+        other.acquire_lease(take_over="a test")
+        record: Any = other.wait(operation, 60.0)
+        other.stop()
+    assert record["state"] == "stopped"
+    until(lambda: client.panorama(name)["state"] == "ended", "its end")
+    client.use_lease(None)
+    with Client(daemon.url, name="rover") as other:
+        if (control := other.control()) is not None and "lease" in str(control):
+            other.use_lease(other.acquire_lease(take_over="the end")["lease_id"])
+            other.release_lease()
+
+
+def test_a_target_is_kept_drawn_and_goes_into_the_site(client: Client, daemon: RunningDaemon) -> None:
+    client.keep_target("rock", (3.0, 0.2, -0.1), covariance_m2=np.diag([4e-4, 1e-4, 1e-4]).tolist())
+    kept = client.targets()["rock"]
+    assert kept["frame"] == "site" and kept["position_m"] == pytest.approx([3.0, 0.2, -0.1])
+    client.wait(client.point(position_m=(3.0, 0.2, -0.1)))
+    shown = daemon.service.targets_in(daemon.service.snapshot("navcam_left", True))["rock"]
+    assert abs(shown["x_px"] - 199.5) < 3 and abs(shown["y_px"] - 149.5) < 3
+    assert shown["major_px"] > shown["minor_px"] > 0.0
+    assert client.forget_target("rock") == {}
+    assert "no target is kept" in refused("target_unknown", lambda: client.forget_target("rock"))
+
+
+def test_the_command_brings_the_folder_shows_composes_exports_and_points(
+    client: Client, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, url = tmp_path / "p", ["--url", client.daemon.url]
+    take = ["panorama", "take", "--pan", "-0.4", "0.4", "--tilt", "-0.5", "-0.3", "--out", str(out), *url]
+    assert main([*take, "--json"]) == 0
+    index = json.loads(capsys.readouterr().out)
+    assert Folder(out).index.id == index["id"]
+    assert main(take) == 2
+    assert "is there already" in capsys.readouterr().err
+    compose = ["panorama", "compose", str(out), "--surface", "sphere:5", "--px-per-deg", "10"]
+    assert main([*compose, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["mosaic"]["surface"] == "sphere:5"
+    sphere, project = tmp_path / "sphere.jpg", tmp_path / "project.pto"
+    assert main(["panorama", "export", str(out), "--gpano", str(sphere)]) == 0
+    assert b"GPano:ProjectionType" in sphere.read_bytes()
+    assert main(["panorama", "export", str(out), "--hugin", str(project)]) == 0
+    assert project.read_text().count("\ni w400 h300") == len(index["views"])
+    capsys.readouterr()
+    assert main(["point", "--panorama", str(out), "--pixel", "200", "100", *url, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["state"] == "done"
+    assert main(["point", "--panorama", str(out), "--pixel", "1", "2", "3", *url]) == 2
+    assert "--panorama FOLDER --pixel X Y" in capsys.readouterr().err
+
+
+def test_a_folder_that_is_none_is_refused_in_a_sentence(tmp_path: Path) -> None:
+    with pytest.raises(BadFile, match=r"index\.yaml"):
+        Folder(tmp_path)
+    (tmp_path / "index.yaml").write_text("schema: mastctl/panorama/1\nid: x\n")
+    with pytest.raises(BadFile, match="the key is missing"):
+        Folder(tmp_path)

@@ -1,0 +1,252 @@
+"""``mastctl panorama``: take, compose, export panoramas, and the targets that are kept by a name."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import io
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mastctl.cli import output
+from mastctl.cli.daemon import DAEMON, client_of, followed
+from mastctl.cli.options import GROUPS, command, finite_number, one_of, option
+from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, check_file
+
+if TYPE_CHECKING:
+    from mastctl.client import Client
+    from mastctl.panorama.folder import Index
+
+GROUPS["panorama"] = "panoramas that the mast takes, and any pixel of which points it"
+FOLDER = option("FOLDER", "a panorama's folder")
+
+
+@command(
+    "panorama take",
+    one_of(
+        option("--pair NAME", "the stereo pair (default: the widest); the mosaic is of its left camera"),
+        option("--camera NAME", "or one camera alone"),
+        option("--resume FOLDER", "go on with one of which views are missing"),
+    ),
+    option("--pan FROM TO", "azimuths of the field, radians (default: the limits)", type=finite_number),
+    option("--tilt FROM TO", "elevations of the field (default -0.7 0.2)", type=finite_number),
+    option("--overlap PART", "of neighbours (default 0.2)", type=finite_number),
+    option("--exposure first|auto-per-view", "fixed from the first view on (default), or each view's own"),
+    option("--out FOLDER", "where the panorama goes"),
+    option("--timeout S", "how long to wait (default 3600 s)", default=3600.0),
+    *DAEMON,
+    help="take a panorama and bring it into a folder",
+    example="--pan -1 1 --tilt -0.6 0 --out panorama",
+)
+def _take(args: argparse.Namespace) -> Answer:
+    if (args.out is None) == (args.resume is None):
+        raise WrongUse("--out FOLDER is expected, or --resume FOLDER")
+    wanted = {name: getattr(args, name) for name in ("pair", "camera", "overlap", "exposure")}
+    out = args.out or args.resume
+    if args.resume is not None:
+        if any(one is not None for one in (*wanted.values(), args.pan, args.tilt)):
+            raise WrongUse("--resume goes alone: a panorama goes on as it was begun")
+        wanted = {"resume": _index(args.resume).id}
+    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise CommandError("not_empty", f"{out}: is there already; another name is expected", 2)
+    with client_of(args) as client:
+        operation_id = client.take_panorama(**wanted, pan_rad=args.pan, tilt_rad=args.tilt)
+        name = str(client.operation(operation_id)["request"]["panorama"])
+        try:
+            record = followed(client, operation_id, args.json, args.timeout)
+        finally:
+            _bring(client, name, out)
+    index = _index(out)
+    if record["state"] != "done":
+        error = record["error"] or {"code": record["state"], "message": f"it ended as {record['state']}"}
+        raise CommandError(
+            error["code"],
+            f"{error['message']}; what was taken is in {out}: 'panorama take --resume {out}' goes on",
+        )
+    return Answer(_document(index), _shown(out, index))
+
+
+def _bring(client: Client, name: str, out: Path) -> None:
+    """Copy a panorama from the daemon: what is not there yet, the index last."""
+    from mastctl.panorama.folder import INDEX, MAST, MOSAIC, PREVIEW
+
+    index = client.panorama(name)
+    frames = [one["file"] for view in index["views"] for one in view["frames"].values()]
+    composed = [MOSAIC, PREVIEW] if index.get("mosaic") else []
+    for file in (MAST, *frames, *composed, INDEX):
+        path = out / file
+        if file in frames and path.is_file():
+            continue
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(client.panorama_file(name, file))
+        except OSError as error:
+            raise output.unusable(str(path), f"cannot be written: {error.strerror or error}") from None
+
+
+@command("panorama show", FOLDER, help="say what a panorama holds", example="panorama")
+def _show(args: argparse.Namespace) -> Answer:
+    index = _index(args.folder)
+    return Answer(_document(index), _shown(args.folder, index))
+
+
+@command(
+    "panorama compose",
+    FOLDER,
+    option("--projection equirectangular|cylindrical", "of the mosaic", default="equirectangular"),
+    option("--frame mast|rover", "whose axes azimuth and elevation are of", default="mast"),
+    option("--surface SURFACE", "infinity, sphere:METRES, ground or ground:Z", default="ground"),
+    option("--px-per-deg PX", "resolution (default: the lens' own in its middle)"),
+    option("--raw", "leave the pictures' brightness as it is"),
+    option("--mast OTHER.yaml", "evaluate the angles as read by this mast file"),
+    help="compose the mosaic anew and measure its seams",
+    example="panorama --surface infinity",
+)
+def _compose(args: argparse.Namespace) -> Answer:
+    from calib.files.mast_file import load_rig
+    from calib.geometry.mosaic import MosaicSurface
+    from mastctl.panorama.compose import Composition, compose
+    from mastctl.panorama.folder import Folder
+
+    scale = None if args.px_per_deg is None else math.degrees(args.px_per_deg)
+    wanted = Composition(args.projection, args.frame, MosaicSurface.of(args.surface), scale, args.raw)
+    folder = Folder(args.folder)
+    compose(folder, wanted, None if args.mast is None else load_rig(args.mast).rig)
+    return Answer(_document(folder.index), _shown(args.folder, folder.index))
+
+
+@command(
+    "panorama export",
+    FOLDER,
+    one_of(
+        option("--gpano FILE", "a JPEG or PNG that viewers open as a sphere"),
+        option("--hugin FILE.pto", "a project of Hugin with the known angles, of things at infinity"),
+        required=True,
+    ),
+    help="write a panorama for other programs",
+    example="panorama --gpano sphere.jpg",
+)
+def _export(args: argparse.Namespace) -> Answer:
+    import cv2
+    import numpy as np
+
+    from mastctl.panorama.exports import gpano, hugin
+    from mastctl.panorama.folder import MOSAIC, Folder
+
+    folder = Folder(args.folder)
+    if folder.index.mosaic is None:
+        raise CommandError(
+            "no_mosaic", f"{args.folder}: 'mastctl panorama compose' makes the mosaic first", 2
+        )
+    canvas, out = folder.index.mosaic.canvas, args.gpano or args.hugin
+    check_file(out, "--gpano" if args.gpano else "--hugin")
+    document: dict[str, Any] = {"file": str(out)}
+    if args.gpano is not None:
+        mosaic = cv2.imread(str(args.folder / MOSAIC), cv2.IMREAD_UNCHANGED)
+        gpano(np.asarray(mosaic, np.uint8), canvas, out)
+        return Answer(document, f"{out}: a sphere's part of {canvas.size_px[0]}x{canvas.size_px[1]} px")
+    camera = folder.index.cameras[0]
+    files = [str((args.folder / view.frames[camera].file).resolve()) for _, view in folder.index.taken()]
+    worst_px = hugin(folder.cameras(), files, canvas, out)
+    return Answer(
+        document | {"lens_off_px": worst_px},
+        f"{out}: {len(files)} pictures, Hugin's lens is {worst_px:.2f} px off",
+    )
+
+
+@command(
+    "panorama targets",
+    option("--csv FILE", "write them as CSV too"),
+    option("--geojson FILE", "or as features of points, metres"),
+    *DAEMON,
+    help="list the targets that are kept by a name",
+)
+def _targets(args: argparse.Namespace) -> Answer:
+    with client_of(args) as client:
+        found = client.targets()
+    if args.csv is not None:
+        text = io.StringIO()
+        rows = csv.writer(text, lineterminator="\n")
+        rows.writerow(["name", "frame", "x_m", "y_m", "z_m", "covariance_m2"])
+        for name, one in found.items():
+            covariance = one["covariance_m2"]
+            flat = "" if covariance is None else " ".join(repr(value) for row in covariance for value in row)
+            rows.writerow([name, one["frame"], *map(repr, one["position_m"]), flat])
+        check_file(args.csv, "--csv")
+        args.csv.write_text(text.getvalue(), encoding="utf-8")
+    if args.geojson is not None:
+        features = [
+            {
+                "type": "Feature",
+                "geometry": {"type": "Point", "coordinates": one["position_m"]},
+                "properties": {"name": name, "frame": one["frame"], "covariance_m2": one["covariance_m2"]},
+            }
+            for name, one in found.items()
+        ]
+        check_file(args.geojson, "--geojson")
+        document = {"type": "FeatureCollection", "features": features}
+        args.geojson.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    return Answer({"targets": found})
+
+
+@command(
+    "panorama keep",
+    option("NAME", "of the target", dest="name"),
+    one_of(
+        option("--position X Y Z", "a point, metres"),
+        option("--operation ID", "what this pointing measured"),
+        required=True,
+    ),
+    option("--frame rover|site", "frame of --position", default="rover"),
+    *DAEMON,
+    help="keep a target by a name",
+    example="rock --operation 000003-1a2b",
+)
+def _keep(args: argparse.Namespace) -> Answer:
+    with client_of(args) as client:
+        position, frame, covariance = args.position, args.frame, None
+        if args.operation is not None:
+            record = client.operation(args.operation)
+            position, frame = record["position_m"], "rover"
+            measured = [one["detail"] for one in record["steps"] if one["name"] == "triangulate"]
+            covariance = measured[-1].get("covariance_m2") if measured else None
+            if position is None:
+                raise CommandError("no_position", f"operation {args.operation} measured no position")
+        return Answer({"targets": client.keep_target(args.name, position, frame, covariance)})
+
+
+@command("panorama forget", option("NAME", "of the target", dest="name"), *DAEMON, help="forget a target")
+def _forget(args: argparse.Namespace) -> Answer:
+    with client_of(args) as client:
+        return Answer({"targets": client.forget_target(args.name)})
+
+
+def _index(folder: Path) -> Index:
+    from mastctl.panorama.folder import Folder
+
+    return Folder(folder).index
+
+
+def _document(index: Index) -> dict[str, Any]:
+    document: dict[str, Any] = index.model_dump(mode="json", by_alias=True, exclude_none=True)
+    return document
+
+
+def _shown(folder: Path, index: Index) -> list[str | Shown]:
+    """What people see of a panorama: how many views, its mosaic, and what the seams say."""
+    states = [view.state for view in index.views]
+    counts = ", ".join(f"{states.count(state)} {state}" for state in sorted(set(states)))
+    lines: list[str | Shown] = [f"{folder}: panorama {index.id} of {index.cameras[0]}, views: {counts}"]
+    lines += [f"view {at}: {one.state}: {one.reason}" for at, one in enumerate(index.views) if one.reason]
+    if index.mosaic is not None:
+        width, height = index.mosaic.size_px
+        lines.append(f"mosaic: {width}x{height} px, {index.mosaic.projection}, for {index.mosaic.surface}")
+    if index.whole is not None:
+        (x, y), (sx, sy) = index.whole.rms_px, index.whole.sigma_px
+        lines.append(
+            f"seams: {x:.3f}, {y:.3f} px rms of {index.whole.count} patches "
+            f"(the matches alone: {sx:.3f}, {sy:.3f} px)"
+        )
+    return lines + ([index.slip.sentence] if index.slip is not None else [])

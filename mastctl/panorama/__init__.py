@@ -1,0 +1,1 @@
+"""Panoramas: taken by the mast, composed by its calibrated models, and clicked."""

@@ -1,0 +1,157 @@
+"""From a panorama's pictures to its mosaic, its seams, and the picture behind each of its pixels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+
+from calib.errors import BadFile
+from calib.geometry.mosaic import Canvas, MosaicSurface, Projection, canvas_of
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import FloatArray, Rigid
+from calib.matching.mosaic import Picture, SeamError, Slip, composed, frames_of, gains_of, seams_of, slip_of
+from mastctl.errors import BadRequest
+from mastctl.panorama.folder import (
+    MOSAIC,
+    PREVIEW,
+    PREVIEW_PX,
+    Folder,
+    MosaicRecord,
+    SeamRecord,
+    SlipRecord,
+    write_picture,
+)
+
+GROUND = MosaicSurface("ground", 0.0)
+JPEG = {cv2.IMWRITE_JPEG_QUALITY: 85}
+
+
+@dataclass(frozen=True)
+class Composition:
+    """How a mosaic is wanted; without ``px_per_rad`` at the lens' resolution in its middle."""
+
+    projection: Projection = "equirectangular"
+    frame: Literal["mast", "rover"] = "mast"
+    surface: MosaicSurface = GROUND
+    px_per_rad: float | None = None
+    raw: bool = False
+
+
+def canvas_for(folder: Folder, wanted: Composition, rig: Rig | None = None) -> Canvas:
+    """Return the canvas of the views that were taken. Raises CalibError."""
+    mast = (rig or folder.mast.rig).mast
+    origin = mast.rover_from_mast
+    if wanted.frame == "rover":
+        origin = Rigid(np.eye(3), origin.translation_m)
+    return canvas_of(folder.cameras(rig), origin, wanted.surface, wanted.projection, wanted.px_per_rad)
+
+
+def compose(folder: Folder, wanted: Composition, rig: Rig | None = None) -> Picture:
+    """Write the mosaic, the preview and the seams' errors into a folder, and return the mosaic.
+
+    ``rig``: another mast file's, with which the angles as read are evaluated. Raises BadFile, CalibError.
+    """
+    index = folder.index
+    if not index.taken():
+        raise BadFile(folder.path, "views", "none was taken, so there is no mosaic")
+    cameras, pictures = folder.cameras(rig), folder.pictures()
+    canvas = canvas_for(folder, wanted, rig)
+    owners, places = frames_of(canvas, cameras)
+    gains = None if wanted.raw else gains_of(canvas, cameras, pictures)
+    mosaic = composed(pictures, owners, places, gains)
+    del owners, places
+    seams, by, camera = seams_of(canvas, cameras, pictures), rig or folder.mast.rig, index.cameras[0]
+    slip = slip_of(by, camera, folder.angles_rad(rig), canvas, seams.patches)
+    write_picture(folder.path / MOSAIC, mosaic, {cv2.IMWRITE_PNG_COMPRESSION: 1})
+    write_picture(folder.path / PREVIEW, reduced(mosaic), JPEG)
+    numbers = [number for number, _ in index.taken()]
+    folder.save(
+        index.model_copy(
+            update={
+                "mosaic": MosaicRecord.of(canvas, wanted.frame, gains),
+                "seams": [
+                    _seam([numbers[i], numbers[j]], one) for (i, j), one in sorted(seams.by_views.items())
+                ],
+                "whole": None if seams.whole is None else _seam([], seams.whole),
+                "slip": None if slip is None else _slip(slip, numbers),
+            }
+        )
+    )
+    return mosaic
+
+
+def so_far(folder: Folder) -> bytes:
+    """Return what was taken so far as a JPEG of a preview's size, composed for the default surface."""
+    cameras = folder.cameras()
+    canvas = canvas_for(folder, Composition(px_per_rad=300.0))
+    owners, places = frames_of(canvas, cameras)
+    picture = reduced(composed(folder.pictures(), owners, places))
+    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 85])[1])
+
+
+def reduced(mosaic: Picture) -> Picture:
+    """Return a mosaic at the size of a preview."""
+    part = min(1.0, PREVIEW_PX / mosaic.shape[1])
+    return np.asarray(cv2.resize(mosaic, None, fx=part, fy=part, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """The picture behind a mosaic's pixel: its view, the pixel (2,) in it, and the surface's point (3,)."""
+
+    view: int
+    pixel_px: FloatArray
+    point_m: FloatArray
+
+
+def picture_at(folder: Folder, pixel_px: tuple[float, float], rig: Rig | None = None) -> Seen:
+    """Return which picture a mosaic's pixel is of, and where: by the map that drew it.
+
+    Raises BadRequest ``no_mosaic``, ``outside_panorama``.
+    """
+    record = folder.index.mosaic
+    if record is None:
+        raise BadRequest("no_mosaic", f"panorama {folder.index.id} is not composed yet")
+    canvas, pixel = record.canvas, np.array(pixel_px)
+    best: tuple[float, Seen] | None = None
+    for (number, _), camera in zip(folder.index.taken(), folder.cameras(rig), strict=True):
+        found, seen = canvas.in_camera(camera, pixel)
+        if not bool(seen) or not camera.holds(found):
+            continue
+        far = float(np.linalg.norm(found - np.array(camera.image_center_px)))
+        if best is None or far < best[0]:
+            best = far, Seen(number, np.asarray(found), canvas.points(pixel))
+    if best is None:
+        width, height = canvas.size_px
+        place = f"({pixel_px[0]:g}, {pixel_px[1]:g})"
+        raise BadRequest(
+            "outside_panorama",
+            f"pixel {place} of {width}x{height} px of panorama {folder.index.id} shows no view",
+        )
+    return best[1]
+
+
+def _seam(views: list[int], error: SeamError) -> SeamRecord:
+    return SeamRecord(
+        views=views, rms_px=list(error.rms_px), sigma_px=list(error.sigma_px), count=error.count,
+        left_out=error.left_out,
+    )  # fmt: skip
+
+
+def _slip(slip: Slip, numbers: list[int]) -> SlipRecord:
+    view = numbers[slip.from_view]
+    where = "in all views" if slip.from_view == 0 else f"from view {view} on"
+    size = f"{1e3 * slip.size_rad:+.2f} ± {1e3 * slip.sigma_rad:.2f} mrad"
+    return SlipRecord(
+        axis=slip.axis, from_view=view, size_rad=slip.size_rad, sigma_rad=slip.sigma_rad,
+        sentence=f"{slip.axis} truly stood {size} beside its reading {where}",
+    )  # fmt: skip
+
+
+def degrees_of(px_per_rad: float) -> float:
+    """Return pixels per degree."""
+    return px_per_rad * math.pi / 180.0

@@ -1,0 +1,157 @@
+"""A panorama for other programs: a picture that viewers open as a sphere, and a project of Hugin."""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.optimize import least_squares
+
+from calib.errors import BadFile
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.mosaic import Canvas
+from calib.geometry.rigid import FloatArray
+from calib.matching.mosaic import Picture
+
+XMP = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
+<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
+<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/"
+ GPano:UsePanoramaViewer="True" GPano:ProjectionType="{projection}"{facts}/>
+</rdf:RDF></x:xmpmeta>
+<?xpacket end="w"?>"""
+JPEG_QUALITY = 92
+FIT_STEPS = 15
+"""Pixels across and down of which a lens is fitted."""
+
+
+def gpano(mosaic: Picture, canvas: Canvas, path: Path) -> None:
+    """Write a mosaic as JPEG or PNG (by the suffix) with GPano XMP: which part of the sphere it is.
+
+    The middle of the sphere is straight ahead, azimuth and elevation 0. Raises BadFile.
+    """
+    height, width = mosaic.shape[:2]
+    full = 2 * round(math.pi * canvas.px_per_rad)
+    left, top = _corner(canvas, full, full // 2)
+    facts = {
+        "FullPanoWidthPixels": full,
+        "FullPanoHeightPixels": full // 2,
+        "CroppedAreaImageWidthPixels": width,
+        "CroppedAreaImageHeightPixels": height,
+        "CroppedAreaLeftPixels": left,
+        "CroppedAreaTopPixels": top,
+    }
+    text = "".join(f'\n GPano:{name}="{value}"' for name, value in facts.items())
+    xmp = XMP.format(projection=canvas.projection, facts=text).encode()
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    png = path.suffix.lower() == ".png"
+    done, data = cv2.imencode(".png" if png else ".jpg", mosaic, [] if png else options)
+    if not done or path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise BadFile(path, "", "a name that ends with .jpg or .png is expected")
+    picture = data.tobytes()
+    if png:
+        chunk = b"iTXt" + b"XML:com.adobe.xmp\x00\x00\x00\x00\x00" + xmp
+        packed = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
+        at = 8 + 25  # behind the signature and IHDR
+    else:
+        body = b"http://ns.adobe.com/xap/1.0/\x00" + xmp
+        packed = b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body
+        at = 2  # behind the start of the image
+    _write(path, picture[:at] + packed + picture[at:])
+
+
+def hugin(cameras: Sequence[CameraModel], files: Sequence[str], canvas: Canvas, path: Path) -> float:
+    """Write a project of Hugin with the known angles; return how far its lens is off at most, px.
+
+    ``cameras``: in the rover frame, all of one lens. Hugin has one centre for all pictures, so the project is
+    of things at infinity. Its lens is fitted to the rays of the first camera. Raises BadFile.
+    """
+    width, height = cameras[0].size_px
+    lens, turn, worst_px = _hugin_lens(cameras[0])
+    names = "vabcde"
+    fov = " ".join(f"{name}{value!r}" for name, value in zip(names, lens.tolist(), strict=True))
+    w, h = canvas.size_px
+    whole = 4 * math.floor(math.pi / 2.0 * canvas.px_per_rad)  # nearly a whole sphere, cropped to the mosaic
+    left, top = _corner(canvas, whole, whole // 2)
+    field = f"w{whole} h{whole // 2} v{math.degrees(whole / canvas.px_per_rad)!r}"
+    crop = f"S{left},{left + w},{top},{top + h}"
+    lines = [f'p f2 {field} E0 R0 {crop} n"TIFF_m c:LZW"', "m g1 i0 m2 p0.00784314"]
+    mosaic_from_rover = canvas.rover_from_mosaic.inverse
+    for number, (camera, file) in enumerate(zip(cameras, files, strict=True)):
+        yaw, pitch, roll = _angles_deg(mosaic_from_rover.rotation @ _axes(camera) @ turn)
+        own = fov if not number else " ".join(f"{name}=0" for name in names)
+        lines.append(
+            f"i w{width} h{height} f0 {own} r{roll!r} p{pitch!r} y{yaw!r} "
+            f'TrX0 TrY0 TrZ0 j0 g0 t0 Va1 Vb0 Vc0 Vd0 Vx0 Vy0 Vm5 n"{file}"'
+        )
+    _write(path, ("# hugin project file\n#hugin_ptoversion 2\n" + "\n".join(lines) + "\n").encode())
+    return worst_px
+
+
+def _corner(canvas: Canvas, width: int, height: int) -> tuple[int, int]:
+    """Column and row of a mosaic's top-left pixel in a picture of the sphere, 0, 0 in its middle."""
+    left = canvas.azimuth_rad * canvas.px_per_rad + (width - 1) / 2.0
+    return round(left), round((height - 1) / 2.0 - canvas.elevation_rad * canvas.px_per_rad)
+
+
+def _hugin_lens(camera: CameraModel) -> tuple[FloatArray, FloatArray, float]:
+    """Hugin's (v deg, a, b, c, d, e) of a camera, its axes in the camera's (3, 3), the worst misfit, px."""
+    width, height = camera.size_px
+    grid = np.stack(
+        np.meshgrid(np.linspace(0, width - 1, FIT_STEPS), np.linspace(0, height - 1, FIT_STEPS)), axis=-1
+    ).reshape(-1, 2)
+    local = camera.ray(grid).directions @ _axes(camera)
+
+    def off(parameters: FloatArray) -> FloatArray:
+        rays = local @ _turned(parameters[6:])
+        ideal = _hugin_pixels(parameters[:6], rays, camera.size_px)
+        return np.asarray((ideal - grid).ravel())
+
+    fov_deg = math.degrees(2.0 * math.atan(width / 2.0 / camera.focal_px[0]))
+    start = np.array([fov_deg, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    found = least_squares(off, start, x_scale=[1.0, 0.01, 0.01, 0.01, 1.0, 1.0, 1e-3, 1e-3, 1e-3], xtol=1e-14)
+    worst = float(np.abs(off(found.x)).max())
+    return found.x[:6], _turned(found.x[6:]), worst
+
+
+def _hugin_pixels(lens: FloatArray, rays: FloatArray, size_px: tuple[int, int]) -> FloatArray:
+    """Where Hugin's rectilinear lens has rays (n, 3) of camera axes: its wiki's polynomial and shift."""
+    fov_deg, a, b, c, d, e = lens
+    width, height = size_px
+    focal = width / 2.0 / math.tan(math.radians(fov_deg) / 2.0)
+    flat = focal * rays[:, :2] / rays[:, 2:]
+    part = np.linalg.norm(flat, axis=1, keepdims=True) / (min(width, height) / 2.0)
+    flat = flat * (a * part**3 + b * part**2 + c * part + (1.0 - a - b - c))
+    return np.asarray(flat + np.array([(width - 1) / 2.0 + d, (height - 1) / 2.0 + e]))
+
+
+def _turned(turn_rad: FloatArray) -> FloatArray:
+    rotation, _ = cv2.Rodrigues(turn_rad)
+    return np.asarray(rotation, dtype=np.float64)
+
+
+def _axes(camera: CameraModel) -> FloatArray:
+    """(3, 3) of a camera's frame in the one of the model: x right, y down, z along A, as columns."""
+    return np.asarray(camera.pose.rotation)
+
+
+def _angles_deg(mosaic_from_camera: FloatArray) -> tuple[float, float, float]:
+    """Hugin's yaw (to the right), pitch (up), roll (clockwise) of camera axes in a frame x ahead, z down."""
+    right, _, ahead = mosaic_from_camera.T
+    yaw = math.atan2(ahead[1], ahead[0])
+    pitch = math.asin(max(-1.0, min(1.0, -float(ahead[2]))))
+    level = np.array([-math.sin(yaw), math.cos(yaw), 0.0])
+    down = np.cross(ahead, level)
+    roll = math.atan2(float(right @ down), float(right @ level))
+    return math.degrees(yaw), math.degrees(pitch), math.degrees(roll)
+
+
+def _write(path: Path, data: bytes) -> None:
+    try:
+        path.write_bytes(data)
+    except OSError as error:
+        raise BadFile(path, "", f"cannot be written: {error.strerror or error}") from None

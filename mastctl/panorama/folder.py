@@ -1,0 +1,264 @@
+"""A panorama's folder: an index, pictures with their facts, the mast file, the mosaic and a preview.
+
+    index.yaml     schema mastctl/panorama/1: what was wanted, each view, the mosaic, its seams
+    mast.yaml      the mast file by which it was taken
+    frames/        NNN-CAMERA.png, as the cameras gave them
+    mosaic.png     composed by the mast file alone; preview.jpg, 2048 pixels wide at most
+
+The index is replaced whole after each view, when its pictures are on the disk. Everything but the state that
+a daemon keeps beside it is in the folder, so it opens anywhere.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import cv2
+import numpy as np
+from pydantic import Field
+
+from calib.errors import BadFile
+from calib.files import read_bytes, replace_bytes, write_new
+from calib.files.mast_file import CameraName, StoredRig, load_rig
+from calib.files.records import ABSENT, Moment, Number, Pair, Record, Text, Vector, parse_record
+from calib.files.yaml_text import dump_mapping
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.mosaic import Canvas, MosaicSurface, Projection
+from calib.geometry.rig import Rig
+from calib.geometry.rigid import Rigid
+from calib.matching.mosaic import Picture
+from mastctl.as_json import as_json
+from mastctl.devices.frames import StampedFrame
+from mastctl.frame_facts import FrameFacts
+
+SCHEMA: Literal["mastctl/panorama/1"] = "mastctl/panorama/1"
+INDEX, MAST, MOSAIC, PREVIEW = "index.yaml", "mast.yaml", "mosaic.png", "preview.jpg"
+PREVIEW_PX = 2048
+MOST_BYTES = 1 << 28
+Count = Annotated[int, Field(ge=0, le=1_000_000)]
+
+
+class FrameRecord(Record):
+    """A picture of a view: its file, the SHA-256 of that, and the facts of a snapshot's headers."""
+
+    file: Text
+    sha256: Text
+    frame_id: Text
+    sequence: Count
+    mid_exposure_s: Number
+    exposure_s: Number
+    pan_rad: Number
+    tilt_rad: Number
+    true_pan_rad: Number
+    true_tilt_rad: Number
+    pan_approach: Number
+    tilt_approach: Number
+    mast_digest: Text
+    settings: dict[str, float | None]
+
+
+class ViewRecord(Record):
+    """One view: the true joint angles that were wanted, and what came of it."""
+
+    pan_rad: Number
+    tilt_rad: Number
+    state: Literal["wanted", "taken", "missing", "forbidden"]
+    reason: str = ""
+    frames: dict[CameraName, FrameRecord] = Field(default_factory=dict)
+    motion_evidence: dict[str, Any] = Field(default_factory=dict)
+
+
+class MosaicRecord(Record):
+    """How the mosaic was composed; its pixels are those of `calib.geometry.mosaic.Canvas`."""
+
+    projection: Projection
+    frame: Literal["mast", "rover"]
+    surface: Text
+    px_per_rad: Number
+    azimuth_rad: Number
+    elevation_rad: Number
+    size_px: Annotated[list[Count], Field(min_length=2, max_length=2)]
+    origin_m: Vector
+    rotation: Annotated[list[Vector], Field(min_length=3, max_length=3)]
+    gains: list[Number] | None = None
+
+    @property
+    def canvas(self) -> Canvas:
+        """The mosaic's pixels as directions."""
+        return Canvas(
+            self.projection,
+            self.px_per_rad,
+            self.azimuth_rad,
+            self.elevation_rad,
+            (self.size_px[0], self.size_px[1]),
+            Rigid(np.array(self.rotation), np.array(self.origin_m)),
+            MosaicSurface.of(self.surface),
+        )
+
+    @staticmethod
+    def of(canvas: Canvas, frame: Literal["mast", "rover"], gains: Any) -> MosaicRecord:
+        """Return the record of a canvas."""
+        return MosaicRecord(
+            projection=canvas.projection,
+            frame=frame,
+            surface=str(canvas.surface),
+            px_per_rad=float(canvas.px_per_rad),
+            azimuth_rad=float(canvas.azimuth_rad),
+            elevation_rad=float(canvas.elevation_rad),
+            size_px=list(canvas.size_px),
+            origin_m=canvas.origin_m.tolist(),
+            rotation=canvas.rover_from_mosaic.rotation.tolist(),
+            gains=None if gains is None else [float(one) for one in gains],
+        )
+
+
+class SeamRecord(Record):
+    """The error of a seam, or of all: rms of dx and dy, px, what the matches explain of it, their count."""
+
+    views: list[Count]
+    rms_px: Pair
+    sigma_px: Pair
+    count: Count
+    left_out: Count
+
+
+class SlipRecord(Record):
+    """A joint that read another angle from a view on, by what the seams say."""
+
+    axis: Literal["pan", "tilt"]
+    from_view: Count
+    size_rad: Number
+    sigma_rad: Number
+    sentence: str
+
+
+class Index(Record):
+    """``index.yaml``. ``cameras``: the one that the mosaic is made of first, then its partner."""
+
+    schema_: Literal["mastctl/panorama/1"] = Field(alias="schema")
+    id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]{0,60}$")]
+    time: Moment
+    cameras: Annotated[list[CameraName], Field(min_length=1, max_length=2)]
+    mast_digest: Text
+    pan_rad: Pair
+    tilt_rad: Pair
+    overlap: Annotated[float, Field(ge=0.05, le=0.8)]
+    exposure: Literal["first", "auto-per-view"]
+    state: Literal["running", "done", "ended"]
+    reason: str = ""
+    views: list[ViewRecord]
+    mosaic: MosaicRecord | None = ABSENT
+    seams: list[SeamRecord] = Field(default_factory=list)
+    whole: SeamRecord | None = ABSENT
+    slip: SlipRecord | None = ABSENT
+
+    def taken(self) -> list[tuple[int, ViewRecord]]:
+        """Return the views that the mosaic is made of, with their numbers."""
+        return [(at, one) for at, one in enumerate(self.views) if one.state == "taken"]
+
+    def with_view(self, number: int, view: ViewRecord) -> Index:
+        """Return it with another record of one view."""
+        views = [view if at == number else one for at, one in enumerate(self.views)]
+        return self.model_copy(update={"views": views})
+
+
+class Folder:
+    """A panorama on the disk. Raises BadFile if there is none, or its index or mast file cannot be read."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.index = parse_record(Index, read_bytes(path / INDEX, MOST_BYTES), path / INDEX, SCHEMA)
+        self.mast: StoredRig = load_rig(path / MAST)
+
+    @staticmethod
+    def begin(path: Path, index: Index, mast_file: bytes) -> Folder:
+        """Make a folder for a panorama that has no views yet. Raises BadFile."""
+        try:
+            (path / "frames").mkdir(parents=True)
+            write_new(path / MAST, mast_file)
+        except OSError as error:
+            raise BadFile(path, "", f"cannot be written: {error.strerror or error}") from None
+        _save(path, index)
+        return Folder(path)
+
+    def save(self, index: Index) -> None:
+        """Replace the index. Raises BadFile; the old one is then still there."""
+        _save(self.path, index)
+        self.index = index
+
+    def keep(self, number: int, camera: str, frame: StampedFrame) -> FrameRecord:
+        """Write a picture of a view and return its record. Raises BadFile; nothing is left then."""
+        file = f"frames/{number:03d}-{camera}.png"
+        data = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+        try:
+            replace_bytes(self.path / file, data, 0o644)
+        except OSError as error:
+            raise BadFile(self.path / file, "", f"cannot be written: {error.strerror or error}") from None
+        facts = as_json(frame.facts)
+        wanted = {name: facts[name] for name in FrameRecord.model_fields if name in facts}
+        return FrameRecord(file=file, sha256=hashlib.sha256(data).hexdigest(), **wanted)
+
+    def picture(self, frame: FrameRecord) -> Picture:
+        """Return a view's picture. Raises BadFile if it is not the one that was taken."""
+        path = self.path / frame.file
+        data = read_bytes(path, MOST_BYTES)
+        image = None
+        if hashlib.sha256(data).hexdigest() == frame.sha256:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise BadFile(path, "", "is not the picture that was taken; the index has another digest")
+        return np.asarray(image, dtype=np.uint8)
+
+    def frame(self, number: int, camera: str) -> StampedFrame:
+        """Return a picture of a view with its facts, as a camera gave it. Raises BadFile."""
+        record = self.index.views[number].frames[camera]
+        image = self.picture(record)
+        image.setflags(write=False)
+        names = {one.name for one in fields(FrameFacts)}
+        facts = {name: value for name, value in record.model_dump().items() if name in names}
+        return StampedFrame(**facts, camera=camera, moving=False, image=image)
+
+    def angles_rad(self, rig: Rig | None = None) -> list[tuple[float, float]]:
+        """Return true (pan, tilt) of each view that was taken; by another ``rig`` from the angles as read."""
+        found = []
+        for _, view in self.index.taken():
+            frame = view.frames[self.index.cameras[0]]
+            if rig is None:
+                found.append((frame.true_pan_rad, frame.true_tilt_rad))
+            else:
+                read, came = (frame.pan_rad, frame.tilt_rad), (frame.pan_approach, frame.tilt_approach)
+                found.append(rig.joints.true_rad(read, came))
+        return found
+
+    def cameras(self, rig: Rig | None = None) -> list[CameraModel]:
+        """Return the mosaic's camera at each view that was taken, in the rover frame."""
+        name = self.index.cameras[0]
+        by = rig or self.mast.rig
+        return [by.camera_in_rover(name, *angles) for angles in self.angles_rad(rig)]
+
+    def pictures(self) -> list[Picture]:
+        """Return the pictures of the mosaic's camera. Raises BadFile."""
+        name = self.index.cameras[0]
+        return [self.picture(view.frames[name]) for _, view in self.index.taken()]
+
+
+def write_picture(path: Path, picture: Picture, options: Mapping[int, int] | None = None) -> None:
+    """Write a picture by its suffix, whole or not at all. Raises BadFile."""
+    flat = [number for pair in (options or {}).items() for number in pair]
+    data = cv2.imencode(path.suffix, picture, flat)[1].tobytes()
+    try:
+        replace_bytes(path, data, 0o644)
+    except OSError as error:
+        raise BadFile(path, "", f"cannot be written: {error.strerror or error}") from None
+
+
+def _save(path: Path, index: Index) -> None:
+    document = index.model_dump(by_alias=True, exclude_none=True)
+    try:
+        replace_bytes(path / INDEX, dump_mapping(document), 0o644)
+    except OSError as error:
+        raise BadFile(path / INDEX, "", f"cannot be written: {error.strerror or error}") from None
