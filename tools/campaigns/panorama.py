@@ -21,7 +21,7 @@ import numpy as np
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
 from drivers.sim.rover import RoverModel
-from mastctl.cli.tasks import results_of
+from mastctl.cli.experiment import results_of
 from mastctl.client import Client
 from mastctl.daemon import RunningDaemon
 from mastctl.panorama.compose import picture_at
