@@ -23,10 +23,8 @@ from mastctl.setup.machine import (
     ExaminedMachine,
     Level,
     examine_clock,
-    examine_descriptors,
     examine_drivers,
     examine_folder,
-    examine_kept,
     examine_port,
 )
 from mastctl.watch.sentinel import SENTINEL_FOLDER, read_folder, standing
@@ -49,7 +47,6 @@ def examine(
             "configuration", "bad", str(error), "correct it; docs/reference/configuration.md has every key"
         )
         yield examine_clock()
-        yield examine_descriptors()
         return
     yield DoctorFinding("configuration", "good", str(config.path))
     yield from examine_mast_file(config)
@@ -63,9 +60,7 @@ def examine(
     state_folder = config.state_folder or usual_folder(config.path, config.listen.url)
     yield from examine_folder("state folder", state_folder)
     yield from _sentinel(state_folder / SENTINEL_FOLDER)
-    yield examine_kept()
     yield examine_clock()
-    yield examine_descriptors()
 
 
 def next_command(config: str | None, found: Sequence[DoctorFinding]) -> str:

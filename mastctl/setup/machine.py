@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
 import grp
 import os
 import re
-import resource
 import shutil
 import stat
 import time
@@ -17,7 +15,6 @@ from pathlib import Path
 from typing import Literal
 
 from drivers.registry import OURS, InstalledDriver
-from drivers.sim.kept import MOST_BYTES, kept_bytes, kept_home
 
 Level = Literal["good", "unsure", "bad"]
 
@@ -54,48 +51,20 @@ class ExaminedMachine:
 
 
 LEAST_FREE_BYTES = 1_000_000_000  # the recorder's ring of some minutes of two cameras
-LEAST_DESCRIPTORS = 256
 BUILT = datetime(2025, 1, 1, tzinfo=UTC)  # no clock that is right says less
-_NOT_SYNCHRONISED = 0x40  # STA_UNSYNC of adjtimex(2)
 
 
-class _Timex(ctypes.Structure):
-    """The beginning of struct timex, and room for the rest; only ``status`` is read."""
-
-    _fields_ = (
-        ("modes", ctypes.c_uint),
-        ("offset", ctypes.c_long),
-        ("freq", ctypes.c_long),
-        ("maxerror", ctypes.c_long),
-        ("esterror", ctypes.c_long),
-        ("status", ctypes.c_int),
-        ("rest", ctypes.c_long * 64),
-    )
-
-
-def clock_status() -> int | None:
-    """Return the kernel's status bits of the wall clock, None if it is not known."""
-    state = _Timex()
-    return None if ctypes.CDLL(None).adjtimex(ctypes.byref(state)) < 0 else state.status
-
-
-def examine_clock(
-    now_s: Callable[[], float] = time.time, status: Callable[[], int | None] = clock_status
-) -> DoctorFinding:
-    """Look at the wall clock, which dates records, logs and mast files; motion does not depend on it."""
+def examine_clock(now_s: Callable[[], float] = time.time) -> DoctorFinding:
+    """Examine the wall clock, which dates records, logs and mast files; motion does not depend on it."""
     now = datetime.fromtimestamp(now_s(), UTC)
     if now < BUILT:
         message = f"the clock says {now:%Y-%m-%d}, which is past"
         return DoctorFinding("clock", "bad", message, "set it: records and mast files are dated by it")
-    bits = status()
-    if bits is None or bits & _NOT_SYNCHRONISED:
-        message = f"the clock says {now:%Y-%m-%d %H:%M} UTC and follows no time server"
-        return DoctorFinding("clock", "unsure", message, "install chrony or switch systemd-timesyncd on")
-    return DoctorFinding("clock", "good", f"{now:%Y-%m-%d %H:%M} UTC, kept by a time server")
+    return DoctorFinding("clock", "good", f"{now:%Y-%m-%d %H:%M} UTC")
 
 
 def examine_folder(what: str, folder: Path) -> Iterator[DoctorFinding]:
-    """Look whether a folder, or the one that it would be made in, may be written and has room."""
+    """Examine whether a folder, or the one that it would be made in, may be written and has room."""
     present = next(one for one in (folder, *folder.parents) if one.exists())
     if not present.is_dir():
         yield DoctorFinding(what, "bad", f"{present} is no folder", "name another, or move it away")
@@ -131,31 +100,6 @@ def examine_drivers(installed: Sequence[InstalledDriver]) -> Iterator[DoctorFind
             yield DoctorFinding(what, "good", sentence)
 
 
-def examine_kept() -> DoctorFinding:
-    """Look how much is kept of what takes long to make, and how much that can become."""
-    sizes = {kind: kept_bytes(kind) for kind in MOST_BYTES}
-    kinds = ", ".join(f"{kind} {size / 1e6:.0f}" for kind, size in sizes.items())
-    most = sum(MOST_BYTES.values())
-    sentence = f"{kept_home()}: {sum(sizes.values()) / 1e6:.0f} MB ({kinds}) of at most {most / 1e6:.0f} MB"
-    return DoctorFinding("kept", "good", sentence)
-
-
-def examine_descriptors() -> DoctorFinding:
-    """Look how many files, sockets and devices a process of this user may have open."""
-    most = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    sentence = f"{most} files and connections at once"
-    if most != resource.RLIM_INFINITY and most < LEAST_DESCRIPTORS:
-        return DoctorFinding(
-            "descriptors",
-            "unsure",
-            sentence,
-            f"ulimit -n {LEAST_DESCRIPTORS} or more, LimitNOFILE= of the unit",
-        )
-    return DoctorFinding(
-        "descriptors", "good", sentence if most != resource.RLIM_INFINITY else "as many as there are"
-    )
-
-
 SLOWEST_MS = 2  # of an adapter's latency timer: at 50 readings a second 16 ms are most of the time there is
 _NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
 
@@ -169,7 +113,7 @@ def serial_lines(machine: ExaminedMachine) -> list[str]:
 
 
 def examine_port(port: str, machine: ExaminedMachine) -> Iterator[DoctorFinding]:
-    """Look at the port of a head without opening it: opening a line may move what is connected to it."""
+    """Examine the port of a head without opening it: opening a line may move what is connected to it."""
     if "://" in port:
         yield DoctorFinding(
             "port", "unsure", f"{port} is on the network; it is not queried here", "try mastctl run"
