@@ -143,9 +143,8 @@ def predict(model: CameraModel, points_m: FloatArray) -> Prediction:
     """
     points = np.asarray(points_m, dtype=np.float64)
     d = np.subtract(points.T, model.C[:, None], order="C")
-    pixels, d_points, valid = np.empty_like(d[:2]), np.empty((2, *d.shape)), np.empty(len(points), dtype=bool)
     with np.errstate(all="ignore"):
-        model.projection.forward(points, model.C, model.lens_axes, pixels, d_points, valid)
+        pixels, d_points, valid = model.projection.forward(points, model.C, model.lens_axes, True)
         d_step = _step_rates(model, d, pixels, d_points)
     d_step[..., ~valid] = np.nan
     return Prediction(pixels.T, d_step.transpose(2, 0, 1), d_points.transpose(2, 0, 1), valid)

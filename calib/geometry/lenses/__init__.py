@@ -106,102 +106,87 @@ class Projection(ReadOnlyArrays):
         jacobian = np.empty((count if derivatives else 0, 2, 3))
         with np.errstate(all="ignore"):
             for part in _chunks(count):
-                rates = jacobian[part].transpose(1, 2, 0)
-                self.forward(points[part], center, axes, pixels[part].T, rates, valid[part])
+                seen, rates, valid[part] = self.forward(points[part], center, axes, derivatives)
+                pixels[part] = seen.T
+                if derivatives:
+                    jacobian[part] = rates.transpose(2, 0, 1)
         return pixels, jacobian, valid
 
     def forward(
-        self,
-        points: FloatArray,
-        center: FloatArray,
-        axes: FloatArray,
-        pixels: FloatArray,
-        jacobian: FloatArray,
-        valid: np.ndarray,
-    ) -> None:
-        """Fill pixels (2, n), the Jacobian (2, 3, n) if not empty, and validity (n,); NumPy may warn."""
+        self, points: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool
+    ) -> tuple[FloatArray, FloatArray, np.ndarray]:
+        """Return pixels (2, n), the Jacobian (2, 3, n) if wanted, and validity (n,); NumPy may warn."""
         k = self.pixel_from_slope
         local = axes @ np.subtract(points.T, center[:, None], order="C")
-        bent = self.lens.bend(local, jacobian.size > 0)
+        bent = self.lens.bend(local, derivatives)
         seen = k[:, :2] @ bent.slopes
         seen += k[:, 2:]
-        depth = seen[2]
-        np.greater(depth if self.lens.curved else np.minimum(depth, k[2] @ local), 0.0, out=valid)
-        valid &= bent.valid
-        per_depth = np.divide(1.0, depth, out=depth)
-        np.multiply(seen[:2], per_depth, out=pixels)
-        if not isfinite(np.vdot(pixels.T, pixels.T)):
+        valid = bent.valid & ((seen[2] if self.lens.curved else np.minimum(seen[2], k[2] @ local)) > 0.0)
+        per_depth = 1.0 / seen[2]
+        pixels = seen[:2] * per_depth
+        if not isfinite(np.vdot(pixels, pixels)):
             valid &= np.isfinite(pixels).all(axis=0)
+        jacobian = np.empty((2, 3, 0))
         if bent.rates is not None:
             # Of the plane's three rows by the point, turned by the axes: one product of matrices.
             turned = np.einsum("is,jl->ijsl", k[:, :2], axes.T).reshape(9, 6)
             rows = (turned @ bent.rates.reshape(6, -1)).reshape(3, 3, -1)
             if k[2, :2].any():
                 rows[:2] -= pixels[:, None] * rows[2]
-            np.multiply(rows[:2], per_depth, out=jacobian)
+            jacobian = rows[:2] * per_depth
         if not valid.all():
             pixels[:, ~valid] = np.nan
             jacobian[..., ~valid[: jacobian.shape[2]]] = np.nan
+        return pixels, jacobian, valid
 
     def rays(
         self, pixels: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool
-    ) -> tuple[FloatArray, FloatArray, np.ndarray, FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, ...]:
         """Return origins (n, 3), directions (n, 3) and validity (n,) of the rays of pixels (n, 2).
 
         Then d direction / d pixel and d origin / d pixel, (n, 3, 2) each if wanted, else with no rows.
         """
         count, rows = len(pixels), len(pixels) if derivatives else 0
         origins, directions, valid = np.empty((count, 3)), np.empty((count, 3)), np.empty(count, dtype=bool)
-        d_directions, d_origins = np.empty((rows, 3, 2)), np.zeros((rows, 3, 2))
-        filled = (origins, directions, valid, d_directions, d_origins)
+        filled = origins, directions, valid, np.empty((rows, 3, 2)), np.zeros((rows, 3, 2))
         with np.errstate(all="ignore"):
             for part in _chunks(count):
-                self._rays(pixels[part], center, axes, *(array[part] for array in filled))
+                found = self._rays(pixels[part], center, axes, derivatives)
+                for whole, one in zip(filled, found, strict=False):
+                    whole[part] = one
+        if not valid.all():
+            for array in (origins, directions, *filled[3:]):
+                array[~valid[: len(array)]] = np.nan
         return filled
 
     def _rays(
-        self,
-        pixels: FloatArray,
-        center: FloatArray,
-        axes: FloatArray,
-        origins: FloatArray,
-        directions: FloatArray,
-        valid: np.ndarray,
-        d_directions: FloatArray,
-        d_origins: FloatArray,
-    ) -> None:
-        """Fill the rays of one chunk, and their derivatives if these have rows."""
+        self, pixels: FloatArray, center: FloatArray, axes: FloatArray, derivatives: bool
+    ) -> Iterator[FloatArray]:
+        """Yield the same of one chunk."""
         lens, k = self.lens, self.slope_from_pixel
         seen = k[:, :2] @ pixels.T
         seen += k[:, 2:]
-        slopes, per_w = seen[:2], seen[2]
-        np.greater(per_w, 0.0, out=valid)
-        np.divide(1.0, per_w, out=per_w)
-        slopes *= per_w
-        ray = lens.unbend(slopes, len(d_directions) > 0)
-        valid &= ray.valid & np.isfinite(ray.directions).all(axis=0)
+        per_w = 1.0 / seen[2]
+        slopes = seen[:2] * per_w
+        ray = lens.unbend(slopes, derivatives)
+        valid = ray.valid & (seen[2] > 0.0) & np.isfinite(ray.directions).all(axis=0)
         if not lens.curved:
             valid &= self.pixel_from_slope[2] @ ray.directions > 0.0
-        np.matmul(ray.directions.T, axes, out=directions)
-        origins[...] = center
-        if ray.shift_m is not None:
-            origins += ray.shift_m[:, None] * axes[2]
+        yield center if ray.shift_m is None else center + ray.shift_m[:, None] * axes[2]
+        yield ray.directions.T @ axes
+        yield valid
 
         def by_pixel(rates: FloatArray) -> FloatArray:
-            """Rates (m, 2, n) to slopes as rates to pixels."""
+            """Rates (m, 2, n) to slopes as rates (n, m, 2) to pixels."""
             per_pixel = np.tensordot(k[:2, :2], rates, axes=(0, 1)).swapaxes(0, 1)
             per_pixel -= (rates * slopes).sum(axis=1)[:, None] * k[2, :2, None]
             per_pixel *= per_w
-            return per_pixel
+            return per_pixel.transpose(2, 0, 1)
 
         if ray.rates is not None:
-            turned = (axes.T @ ray.rates.reshape(3, -1)).reshape(3, 2, -1)
-            d_directions.transpose(1, 2, 0)[...] = by_pixel(turned)
+            yield by_pixel((axes.T @ ray.rates.reshape(3, -1)).reshape(3, 2, -1))
         if ray.shift_rates is not None:
-            d_origins[...] = axes[2][:, None] * by_pixel(ray.shift_rates[None])[0].T[:, None]
-        if not valid.all():
-            for array in (origins, directions, d_directions, d_origins):
-                array[~valid[: len(array)]] = np.nan
+            yield axes[2][:, None] * by_pixel(ray.shift_rates[None])
 
 
 def _chunks(count: int) -> Iterator[slice]:

@@ -124,11 +124,8 @@ class OpencvLens:
             return Bent(slopes, valid)
         found = np.empty((2, 3, len(w)))
         for row, by_x, by_y in zip(found, rates[::2], rates[1::2], strict=True):
-            np.multiply(by_x, per_w, out=row[0])
-            np.multiply(by_y, per_w, out=row[1])
-            np.multiply(row[0], x, out=row[2])
-            row[2] += row[1] * y
-            np.negative(row[2], out=row[2])
+            row[0], row[1] = by_x * per_w, by_y * per_w
+            row[2] = -(x * row[0] + y * row[1])
         return Bent(slopes, valid, found)
 
     def coefficient_rates(self, local_m: FloatArray) -> FloatArray:

@@ -295,12 +295,12 @@ class RoundLens:
         if not derivatives:
             return Bent(slopes, valid)
         growth = polynomial(self._growth, chi2)
-        x, y = local_m[:2] / lam
+        along = local_m[:2] / lam
         rates = np.empty((2, 3, len(w)))
-        _about_axis(rates[:, :2], x, y, m, growth * by_lam - m)
-        growth *= by_w
-        np.multiply(growth, x, out=rates[0, 2])
-        np.multiply(growth, y, out=rates[1, 2])
+        np.multiply(along * (growth * by_lam - m), along[:, None], out=rates[:, :2])
+        rates[0, 0] += m
+        rates[1, 1] += m
+        np.multiply(along, growth * by_w, out=rates[:, 2])
         return Bent(slopes, valid, rates)
 
     def coefficient_rates(self, local_m: FloatArray) -> FloatArray:
@@ -357,10 +357,12 @@ class RoundLens:
             return Unbent(directions, valid, None, shift_m)
         turn = 1.0 / polynomial(self._growth, chi * chi)  # d theta / d chi'
         turn *= cosine * cosine if not self.curved else 1.0 / self._chi_rate(theta, chi)
-        x, y = slopes / t
+        along = slopes / t
         rates = np.empty((3, 2, len(t)))
-        _about_axis(rates[:2], x, y, p, cosine * turn - p)
-        np.multiply(-sine * turn, (x, y), out=rates[2])
+        np.multiply(along * (cosine * turn - p), along[:, None], out=rates[:2])
+        rates[0, 0] += p
+        rates[1, 1] += p
+        np.multiply(along, -sine * turn, out=rates[2])
         if self.moving:
             y2 = theta * theta
             # (theta/sin theta)' by its series where the closed form would cancel
@@ -370,7 +372,7 @@ class RoundLens:
                 (sine - theta * cosine) / (sine * sine),
             )
             per_turn = stretch_rate * e + stretch * theta * (2.0 * e1 + 4.0 * e2 * y2)
-            shift_rates = per_turn * turn * np.stack([x, y])
+            shift_rates = per_turn * turn * along
         return Unbent(directions, valid, rates, shift_m, shift_rates)
 
     def _shrink(self, t2: FloatArray) -> FloatArray:
@@ -420,15 +422,3 @@ class RoundLens:
             low, high = np.where(far, low, middle), np.where(far, middle, high)
         # 1.0 - 1e-15: this part of the largest slope is reached for sure; above it rounding decides.
         return np.asarray(np.minimum(low, (1.0 - 1e-15) * self.chi_limit) / t)
-
-
-def _about_axis(out: FloatArray, x: FloatArray, y: FloatArray, even: FloatArray, more: FloatArray) -> None:
-    """Fill (2, 2, n) with even I + more (x, y)(x, y)T."""
-    along = more * x
-    np.multiply(along, x, out=out[0, 0])
-    out[0, 0] += even
-    np.multiply(along, y, out=out[0, 1])
-    out[1, 0] = out[0, 1]
-    np.multiply(more, y, out=along)
-    np.multiply(along, y, out=out[1, 1])
-    out[1, 1] += even
