@@ -29,7 +29,7 @@ import numpy as np
 
 from calib.adjust.gross import bounded
 from calib.adjust.solver import Normal
-from calib.adjust.terms import DRAWING, JOINTS, ImageTerm, StationTerm, lens_knowledge, widened_images
+from calib.adjust.terms import DRAWING, JOINTS, ImageTerm, StationTerm, lens_knowledge, scaled_images
 from calib.adjust.unknowns import JOINT_ERRORS, MAST, Estimate, Key, ResidualBlock, Unknown
 from calib.geometry.covariance import camera_rates
 from calib.geometry.parameters import (
@@ -163,13 +163,11 @@ class Adjustment:
         if self.prism_cad_m > 0:
             for prism in start.prisms_in_rover_m:
                 names, drawn = tuple(f"prism {prism}.{a}" for a in "xyz"), self.prisms_cad_m.get(prism)
-                sigma = None if drawn is None else np.full(3, self.prism_cad_m)
-                yield Unknown(("prism", prism), names, np.ones(3), drawn, sigma, DRAWING)
+                yield Unknown(("prism", prism), names, np.ones(3), drawn, kind=DRAWING)
         if self.joint_rad > 0:
             for index in range(len(start.joints_rad)):
                 names = tuple(f"attitude {index}.{joint}" for joint in ("pan_rad", "tilt_rad"))
-                key, sigma = ("attitude", index), np.full(2, self.joint_rad)
-                yield Unknown(key, names, np.ones(2), np.zeros(2), sigma, JOINTS)
+                yield Unknown(("attitude", index), names, np.ones(2), np.zeros(2), kind=JOINTS)
 
     @property
     def upright(self) -> bool:
@@ -186,16 +184,9 @@ class Adjustment:
 
     def with_sigmas(self, factors: Mapping[str, float]) -> Adjustment:
         """Return the same problem with sigmas times ``factors``, by kind (``calib.adjust.noise``)."""
-        unknowns = {
-            key: replace(one, sigma=one.sigma * factors.get(one.kind, 1.0))
-            if one.sigma is not None and one.kind is not None
-            else one
-            for key, one in self._unknowns.items()
-        }
         return self._copy(
-            images=widened_images(self.images, factors),
+            images=scaled_images(self.images, factors),
             station=tuple(replace(p, sigma_m=p.sigma_m * factors.get(p.kind, 1.0)) for p in self.station),
-            _unknowns=unknowns,
             joint_rad=self.joint_rad * factors.get(JOINTS, 1.0),
             prism_cad_m=self.prism_cad_m * factors.get(DRAWING, 1.0),
         )
@@ -515,22 +506,16 @@ class Adjustment:
 
     def known(self, state: Estimate) -> Iterator[tuple[Unknown, ResidualBlock]]:
         """The priors: usual lenses, joints and boards, prisms from CAD, joint readings."""
+        measured = {JOINTS: self.joint_rad, DRAWING: self.prism_cad_m}
         for key, unknown in self._unknowns.items():
-            if key[0] == "camera":
-                model = state.cameras[str(key[1])]
-                if model.kind == "CAHV":
-                    continue
-                residual, rates = lens_knowledge(model)
-            elif (
-                unknown.prior is None
-                or unknown.sigma is None
-                or not len(unknown.names)
-                or (key[0] == "attitude" and not self.joint_rad)
-            ):
-                continue
+            sigma = measured.get(unknown.kind or "", unknown.sigma)
+            if key[0] == "camera" and state.cameras[str(key[1])].kind != "CAHV":
+                residual, rates = lens_knowledge(state.cameras[str(key[1])])
+            elif unknown.prior is not None and sigma > 0 and len(unknown.names):
+                residual = (self.numbers(state, key) - unknown.prior) / sigma
+                rates = np.eye(len(residual)) / sigma
             else:
-                residual = (self.numbers(state, key) - unknown.prior) / unknown.sigma
-                rates = np.diag(1.0 / unknown.sigma)
+                continue
             parts = {key: slice(0, rates.shape[1])}
             yield unknown, ResidualBlock(residual, rates, self.at(key), parts)
 
@@ -572,8 +557,7 @@ class Adjustment:
 
 def _usual(key: Key, names: tuple[str, ...], sigma: float) -> Unknown:
     """Numbers that are usually nothing, to so much; where the data leave them open, that alone decides."""
-    size = len(names)
-    return Unknown(key, names, np.full(size, 1e3), np.zeros(size), np.full(size, sigma))
+    return Unknown(key, names, np.full(len(names), 1e3), np.zeros(len(names)), sigma)
 
 
 def _pose(key: Key, name: str) -> Unknown:

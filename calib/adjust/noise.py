@@ -32,7 +32,7 @@ from scipy.special import chdtr, chdtrc, fdtrc
 
 from calib.adjust.adjustment import Adjustment
 from calib.adjust.gross import GROSS, MANY, Outlier, at_least_stated, bounded
-from calib.adjust.terms import PRISMS, TAPES, ImageTerm, StationTerm, scattered_images, widened_images
+from calib.adjust.terms import PRISMS, TAPES, ImageTerm, StationTerm, scaled_images
 from calib.adjust.unknowns import Estimate, ResidualBlock, Unknown
 from calib.geometry.rigid import FloatArray
 from calib.geometry.significance import Level, typical_scale
@@ -251,7 +251,7 @@ def with_scales(
         sure = np.inf if typical == 1.0 else max(together, 1.0)
         for name, limit in zip(mine, most, strict=True):
             own[name] = _own(mine[name], cameras[kind], sure, limit)
-    every = widened_images(scattered_images(images, own), cameras)
+    every = scaled_images(images, cameras, own)
     kept = [replace(whole, keep=term.keep) for whole, term in zip(every, problem.images, strict=True)]
     return problem.with_terms(kept, problem.station), every, cameras
 

@@ -29,7 +29,7 @@ from calib.adjust.noise import (
 )
 from calib.adjust.outliers import judge, name_outliers
 from calib.adjust.solver import Minimum, minimise
-from calib.adjust.terms import ImageTerm, StationTerm, scattered_images, widened_images
+from calib.adjust.terms import ImageTerm, StationTerm, scaled_images
 from calib.adjust.uncertainty import fitted_fields, image_residuals, open_directions
 from calib.adjust.unknowns import Estimate
 from calib.errors import CalibError
@@ -72,7 +72,7 @@ class Cleaned:
         back = {kind: 1.0 / factor for kind, factor in self.cameras.items()}
         if all(factor == 1.0 for factor in back.values()) and all(t.scatter == 1.0 for t in self.images):
             return self.problem, self.fit
-        images = scattered_images(self.problem.images, {t.name: 1.0 / t.scatter for t in self.images})
+        images = scaled_images(self.problem.images, {}, {t.name: 1.0 / t.scatter for t in self.images})
         problem = self.problem.with_terms(images, self.problem.station).with_sigmas(back)
         return problem, minimise(problem, self.fit.state, weak=problem.weak, gain=1e-11)
 
@@ -121,7 +121,7 @@ def weighed_fields(
     problem, state, covariance = weighed.problem, weighed.fit.state, weighed.fit.covariance
     order_px = survey.sigma.corner_px if survey.boards else survey.sigma.dot_px
     own = own_scales(problem, state, checks, weighed.factors, order_px)
-    sized = widened_images(scattered_images(checks, own), weighed.factors)
+    sized = scaled_images(checks, weighed.factors, own)
     scatter = {t.name: t.scatter for t in (*weighed.images, *sized)}
     residuals = image_residuals(survey, problem, state, images, checks, scatter)
     stated, fit = cleaned.as_stated()
@@ -155,7 +155,7 @@ def weigh(cleaned: Cleaned, *, narrows: bool = True) -> Weighed:
         if count == WEIGHINGS or all(abs(ratio - 1.0) < WEIGHED for ratio in change.values()):
             break
         weighed |= wanted
-        images = widened_images(images, change)
+        images = scaled_images(images, change)
         problem, fit = judged(problem.with_sigmas(change), fit.state, images)
     if not fit.settled:
         raise SurveyNotFitted(

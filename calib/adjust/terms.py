@@ -140,34 +140,27 @@ def image_terms(
 
 def station_terms(survey: Survey, boards: Mapping[tuple[str, str], Rigid]) -> tuple[StationTerm, ...]:
     """Return terms of prisms and of the tapes of every board."""
-    terms = []
+    terms, sigma_m = [], survey.sigma.station_m
     for p in survey.station:
+        board, places = (p.setup, p.placement), survey.board.tapes_in_board_m
         if p.kind == "prism" and p.point in survey.prisms_in_rover_m:
-            terms.append(
-                StationTerm(p.setup, None, p.point, p.position_m, np.zeros(3), survey.sigma.station_m)
-            )
-        elif (
-            p.kind == "tape" and (p.setup, p.placement) in boards and p.point in survey.board.tapes_in_board_m
-        ):
-            place = survey.board.tapes_in_board_m[p.point]
-            board = (p.setup, p.placement)
-            terms.append(StationTerm(p.setup, board, p.point, p.position_m, place, survey.sigma.station_m))
+            terms.append(StationTerm(p.setup, None, p.point, p.position_m, np.zeros(3), sigma_m))
+        elif p.kind == "tape" and board in boards and p.point in places:
+            terms.append(StationTerm(p.setup, board, p.point, p.position_m, places[p.point], sigma_m))
     return tuple(terms)
 
 
-def widened_images(images: Sequence[ImageTerm], factors: Mapping[str, float]) -> tuple[ImageTerm, ...]:
-    """Return the terms with sigmas times ``factors``, by kind."""
-    return tuple(replace(t, sigma_px=t.sigma_px * factors.get(t.kind, 1.0)) for t in images)
-
-
-def scattered_images(images: Sequence[ImageTerm], scales: Mapping[str, float]) -> tuple[ImageTerm, ...]:
-    """Return the terms with the sigmas of some images times ``scales``, by name."""
-    return tuple(
-        replace(t, sigma_px=t.sigma_px * scales[t.name], scatter=t.scatter * scales[t.name])
-        if t.name in scales
-        else t
-        for t in images
-    )
+def scaled_images(
+    images: Sequence[ImageTerm], kinds: Mapping[str, float], own: Mapping[str, float] | None = None
+) -> tuple[ImageTerm, ...]:
+    """Return the terms with sigmas times factors by kind, and times what single images have besides, by
+    name."""
+    scaled = []
+    for t in images:
+        mine = (own or {}).get(t.name, 1.0)
+        sigma_px = t.sigma_px * mine * kinds.get(t.kind, 1.0)
+        scaled.append(replace(t, sigma_px=sigma_px, scatter=t.scatter * mine))
+    return tuple(scaled)
 
 
 LENS_SIGMA: Mapping[str, tuple[float, ...]] = {"O": (0.02,) * 3, "R": (0.5, 1.0), "E": (0.01,) * 3}
@@ -182,15 +175,6 @@ A fit follows that curve for hundreds of steps unless it is short; with 10 inste
 settle in 200, with 1 it takes 10 and leaves the same residuals."""
 
 
-def coefficient_sigma(kind: str) -> FloatArray:
-    """Return what the coefficients of one of OpenCV's families are like, one sigma each (n,)."""
-    return np.array([D_SIGMA[name.rstrip("0123456789").split("_")[0]] for name in _coefficients(kind)])
-
-
-def _coefficients(kind: str) -> list[str]:
-    return [name.removeprefix("D.") for name in parameter_names(kind)[parameter_part(kind, "D")]]
-
-
 HARDLY = 0.7
 """A lens whose sigma stays above this part of what was known beforehand is hardly seen."""
 
@@ -198,13 +182,25 @@ HARDLY_ALONE = 0.5
 """The same of a coefficient: of two or three that go together, each keeps 0.6 to 0.7 of its sigma."""
 
 
+def _lens_sigma(model: CameraModel) -> dict[str, FloatArray]:
+    """What the numbers of a lens are usually like, one sigma each, by letter."""
+    known = {letter: np.array(sigma) for letter, sigma in LENS_SIGMA.items() if letter in model.letters}
+    if "D" in model.letters:
+        kinds = [name.rstrip("0123456789").split("_")[0] for name in _coefficients(model.kind)]
+        known["D"] = np.array([D_SIGMA[kind] for kind in kinds])
+    return known
+
+
+def _coefficients(kind: str) -> list[str]:
+    return [name.removeprefix("D.") for name in parameter_names(kind)[parameter_part(kind, "D")]]
+
+
 def lens_knowledge(model: CameraModel) -> tuple[FloatArray, FloatArray]:
     """Return how far a lens is from usual, in sigmas, and the Jacobian to the step; nothing of a CAHV."""
     kind, size = model.kind, len(parameter_names(model.kind))
     usual = {"O": model.O - model.A, "R": model.R[1:], "E": model.E, "D": model.distortion}
     residuals, rates = [np.zeros(0)], [np.zeros((0, size))]
-    for letter in (letter for letter in usual if letter in model.letters):
-        sigma = coefficient_sigma(kind) if letter == "D" else np.array(LENS_SIGMA[letter])
+    for letter, sigma in _lens_sigma(model).items():
         rows = np.zeros((len(sigma), size))
         rows[:, parameter_part(kind, letter)] = tangents(model.O).T if letter == "O" else np.eye(len(sigma))
         if letter == "O":
@@ -220,21 +216,17 @@ def lens_notes(rig: Rig, sigma: Mapping[str, Any]) -> tuple[str, ...]:
     ``sigma`` is that of ``calib.adjust.result.Calibration``.
     """
     by_parts: dict[str, list[str]] = {}
-    for name, camera in rig.cameras.items():
-        hardly = []
-        for letter, part in (("O", "lens axis"), ("R", "distortion"), ("E", "entrance point")):
-            if letter not in camera.model.letters or name not in sigma["cameras"]:
-                continue
-            found = np.array(sigma["cameras"][name][letter])
-            found = found[1:] if letter == "R" else found[:1] if letter == "E" else found
-            if (found > HARDLY * np.array(LENS_SIGMA[letter])[: len(found)]).any():
-                hardly.append(part)
-        kind = camera.model.kind
-        if "D" in camera.model.letters and name in sigma["cameras"]:
-            open_ones = np.array(sigma["cameras"][name]["distortion"]) > HARDLY_ALONE * coefficient_sigma(
-                kind
-            )
-            hardly += [", ".join(np.array(_coefficients(kind))[open_ones])] if open_ones.any() else []
+    for name, found in sigma["cameras"].items():
+        model, hardly = rig.cameras[name].model, []
+        for letter, usual in _lens_sigma(model).items():
+            if letter == "D":
+                still_open = np.array(found["distortion"]) > HARDLY_ALONE * usual
+                if still_open.any():
+                    hardly.append(", ".join(np.array(_coefficients(model.kind))[still_open]))
+            else:  # R0 is fixed, and of E the first is the entrance point
+                some = np.array(found[letter])[{"R": slice(1, None), "E": slice(1)}.get(letter, slice(None))]
+                if (some > HARDLY * usual[: len(some)]).any():
+                    hardly.append({"O": "lens axis", "R": "distortion", "E": "entrance point"}[letter])
         if hardly:
             by_parts.setdefault(" and ".join(hardly), []).append(name)
     return tuple(

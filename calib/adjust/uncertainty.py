@@ -368,13 +368,13 @@ def _reason(problem: Adjustment, parameters: Sequence[str]) -> str:
 
 def in_english(parameters: Sequence[str]) -> str:
     """Return some parameters as a person says them."""
-    named = list(dict.fromkeys(_in_english(p) for p in parameters))
-    return ", ".join(named[:4]) + (" and more" if len(named) > 4 else "")
-
-
-def _in_english(parameter: str) -> str:
-    """A parameter as a person says it."""
-    first, *rest = parameter.split(".")
-    if first == "mast":
-        return "the mast's " + " ".join(rest).replace("_m", "").replace("_rad", "").replace("_", " ")
-    return f"{rest[1]} of {rest[0]}" if first == "cameras" else f"the {first}'s {rest[0].split('_')[0]}"
+    named = dict[str, None]()
+    for first, *rest in (parameter.split(".") for parameter in parameters):
+        if first == "cameras":
+            name = f"{rest[1]} of {rest[0]}"
+        elif first == "mast":
+            name = "the mast's " + " ".join(rest).replace("_m", "").replace("_rad", "").replace("_", " ")
+        else:
+            name = f"the {first}'s {rest[0].split('_')[0]}"
+        named[name] = None
+    return ", ".join([*named][:4]) + (" and more" if len(named) > 4 else "")

@@ -26,15 +26,15 @@ class Unknown:
     """One thing that a fit moves, its numbers named as a calibration names them (k,).
 
     ``step`` (k,) is how far each may be off at all: one that the data leave open stays where it is. ``prior``
-    and ``sigma`` (k,) are what is known of the numbers beforehand, and how well; ``kind`` is that of the
-    measurement which gives the prior (``calib.adjust.terms``), None for a usual value.
+    (k,) is what is known of the numbers beforehand: by measurements of a ``kind`` (``calib.adjust.terms``),
+    or as usual values to so much (``sigma``).
     """
 
     key: Key
     names: tuple[str, ...]
     step: FloatArray
     prior: FloatArray | None = None
-    sigma: FloatArray | None = None
+    sigma: float = 0.0
     kind: str | None = None
 
 

@@ -104,7 +104,7 @@ def fit_bench(
     return BenchCalibration(
         **fields,
         terms=tuple({**tests, **beside}.values()),
-        gauges=bench.gauges(chosen),
+        gauges=_gauges(bench, chosen),
         drifts=find_drifts(weighed.scored),
         joint_rad=weighed.problem.joint_rad,
         inexact_m=print_error_m(weighed.problem, weighed.fit.state),
@@ -212,31 +212,28 @@ class BenchProblem:
             coherent="the board's measures are wrong",
         )
 
-    def gauges(self, chosen: Mapping[str, ModelTerm]) -> tuple[str, ...]:
-        """Return what pictures cannot determine, and how it was fixed, a sentence each."""
-        if self.known is not None:
-            board, placement = self.known[0]
-            where = f"the rover frame hangs on placement {placement} of board {board}, whose pose was stated"
-        elif self.rover_from_mast is not None:
-            where = "the mast stands in the rover frame as was stated, with no uncertainty"
-        else:
-            where = (
-                "the rover frame is the mast's at zero angles (z down along the pan axis): where the "
-                "vehicle is, pictures cannot show"
-            )
-        gauges = [
-            where,
-            "its origin is where the pan axis is nearest to the tilt axis: pictures determine no other "
-            "height along it",
-            "pan is zero where the tilt axis points to y, tilt where the head's x lies square to pan. An "
-            "offset of either would turn the frame or all head cameras, and is none",
-            "every length is as long as the boards were measured: 0.1 % there is 0.1 % of every range",
-        ]
-        if "tilt harmonic 1" in chosen:
-            gauges.append(
-                "the first harmonic of tilt is encoder and an arm's sag: pictures cannot separate them"
-            )
-        return tuple(gauges)
+
+GAUGES = (
+    "its origin is where the pan axis is nearest to the tilt axis: pictures show no other height along it",
+    "pan is zero where the tilt axis points to y, tilt where the head's x lies square to pan. An offset of "
+    "either would turn the frame or all head cameras, and is none",
+    "every length is as long as the boards were measured: 0.1 % there is 0.1 % of every range",
+)
+
+
+def _gauges(bench: BenchProblem, chosen: Mapping[str, ModelTerm]) -> tuple[str, ...]:
+    """What pictures cannot determine, and how it was fixed, a sentence each."""
+    where = (
+        "the rover frame is the mast's at zero angles (z down along the pan axis): where the vehicle is, "
+        "pictures cannot show"
+    )
+    if bench.known is not None:
+        board, placement = bench.known[0]
+        where = f"the rover frame hangs on placement {placement} of board {board}, whose pose was stated"
+    elif bench.rover_from_mast is not None:
+        where = "the mast stands in the rover frame as was stated, with no uncertainty"
+    sag = "the first harmonic of tilt is encoder and an arm's sag: pictures cannot separate them"
+    return (where, *GAUGES, sag) if "tilt harmonic 1" in chosen else (where, *GAUGES)
 
 
 def bench_terms(survey: Survey, notes: list[str]) -> tuple[list[ImageTerm], list[ImageTerm], int]:

@@ -14,7 +14,6 @@ joints to read true.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -57,8 +56,7 @@ class SomethingChanged(BenchNotFitted):
     not help, a person has to."""
 
 
-@dataclass(frozen=True, eq=False)
-class BenchStart:
+class BenchStart(NamedTuple):
     """The state to begin with, images that do not agree with it, and sentences for a person."""
 
     estimate: Estimate
@@ -180,7 +178,11 @@ def _tie(images: Sequence[ImageTerm], view: ViewPoses) -> _Tied:
         seen = np.array([pose.rotation for pose in chosen])
         in_head, in_mast = _rotations(gimbals, seen, at, len(boards), weight)
         wanted = (gimbals @ in_head).transpose(0, 2, 1) @ in_mast[at]
-        chosen = [_nearest(view.poses[t.name], turn) for t, turn in zip(images, wanted, strict=True)]
+        # Of the poses of an image that which is turned least from what the rest says.
+        chosen = [
+            view.poses[t.name][int(np.argmax([np.sum(p.rotation * turn) for p in view.poses[t.name]]))]
+            for t, turn in zip(images, wanted, strict=True)
+        ]
         seen = np.array([pose.rotation for pose in chosen])
         off = _angles(gimbals @ in_head @ seen, in_mast[at])
         typical = max(float(np.median(off)), SMALLEST)
@@ -246,11 +248,6 @@ def _places(
         typical = max(float(np.median(off[good])), SMALLEST)
         weight = np.where(good, np.sqrt(bounded(off, typical)), 0.0)
     return solved[:3], solved[3:].reshape(-1, 3)
-
-
-def _nearest(poses: Sequence[Rigid], rotation: FloatArray) -> Rigid:
-    """Of the poses of an image the one turned least from what the rest says."""
-    return max(poses, key=lambda pose: float(np.sum(pose.rotation * rotation)))
 
 
 def _angles(one: FloatArray, other: FloatArray) -> FloatArray:

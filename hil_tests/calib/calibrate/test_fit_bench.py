@@ -162,7 +162,7 @@ def test_pictures_that_the_start_doubts_come_back(monkeypatch: pytest.MonkeyPatc
 
     def doubting(images: list[ImageTerm], *rest: Any) -> BenchStart:
         start = bench_start(images, *rest)
-        return replace(start, doubtful=frozenset(t.name for t in images if t.attitude in (1, 4, 6, 9, 13)))
+        return start._replace(doubtful=frozenset(t.name for t in images if t.attitude in (1, 4, 6, 9, 13)))
 
     monkeypatch.setattr(bench, "bench_start", doubting)
     plan = BenchPlan(attitudes=8, checks=0, own_px=0.01, **{**SERVO, "count_rad": 5e-5})
