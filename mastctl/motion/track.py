@@ -1,8 +1,8 @@
 """The track of a daemon: started, carried over each motion of the rover, looked for, stopped.
 
-A look is an operation like a pointing: one at a time, through the same limits, ended by the same stop. A
-pose that comes while one runs waits for its end; if the rover moved meanwhile, the look's images belong to
-no one pose and are dropped, and the next look follows at once.
+A look is an operation like a pointing: one at a time, through the same limits, ended by the same stop. If a
+pose that comes while one runs says that the rover moved, the look's images belong to no one pose and are
+dropped, and the next look follows at once.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -272,9 +272,9 @@ class Tracker:
         self._on_matched = on_matched
         self._lock = threading.Lock()
         self._status = TrackStatus()
-        self._waiting: list[RoverPose] = []  # poses that came while a look runs
+        self._looking_from: RoverPose | None = None  # where what runs takes its images
+        self._moved = self._left = False  # whether the rover moved from there; by a pose that was refused
         self._look_again = False
-        self._left = False  # whether the rover left, by a refused pose, where what runs takes its images
 
     @property
     def status(self) -> TrackStatus:
@@ -300,9 +300,9 @@ class Tracker:
                     return search.begin_at_pixel(request.pixel)
                 return search.begin_at_position(np.array(request.position_m))
 
-            operation = self._run(recorded, begin)
             pose = self._status.pose
-            self._waiting, self._look_again = [], False
+            operation = self._run(recorded, begin, pose)
+            self._look_again = False
             self._publish(
                 TrackStatus(
                     state="starting", id=operation.id, stands_at=pose, pose=pose, operation=operation.id
@@ -344,15 +344,16 @@ class Tracker:
                 self._end(status, FIRST_POSE)
                 return None
             if active:
-                stood = status.stands_at
-                if stood is not None and not is_still(motion_between(stood, pose)):
-                    status = replace(status, predicted=True)
-                if status.operation is not None:
-                    self._waiting.append(pose)
-                    self._look_again = self._look_again or look
-                else:
+                stood = self._looking_from if status.operation else status.stands_at
+                moved = stood is not None and not is_still(motion_between(stood, pose))
+                status = replace(status, predicted=status.predicted or moved)
+                if status.track is not None:
                     status = self._carry(status, pose)
-                    status = self._looked_for(status) if look else status
+                if status.operation is not None:
+                    self._moved = self._moved or moved
+                    self._look_again = self._look_again or look
+                elif look:
+                    status = self._looked_for(status)
             self._publish(status)
             return status.operation
 
@@ -368,7 +369,7 @@ class Tracker:
                 raise NotNow("no_track", "no track runs that could be looked for")
             if status.owed is not None:
                 raise NotNow("no_track", status.reason)
-            operation = self._begin_look(status.track)
+            operation = self._begin_look(status, status.track)
             self._publish(replace(status, operation=operation.id))
             return operation
 
@@ -396,7 +397,7 @@ class Tracker:
 
     def _end(self, status: TrackStatus, reason: str) -> None:
         """Follow nothing any more."""
-        self._waiting, self._look_again = [], False
+        self._look_again = False
         self._publish(replace(status, state="stopped", reason=reason, operation=None))
         log.info("track %s stopped: %s", status.id, reason)
 
@@ -414,10 +415,13 @@ class Tracker:
         track = replace(track, state="lost")
         self._publish(replace(self._status, state="lost", predicted=True, reason=reason, track=track))
 
-    def _run(self, recorded: Mapping[str, Any], work: Callable[[TargetSearch], Outcome]) -> Operation:
-        """Start an operation that looks; its outcome comes to `_ended`."""
+    def _run(
+        self, recorded: Mapping[str, Any], work: Callable[[TargetSearch], Outcome], pose: RoverPose | None
+    ) -> Operation:
+        """Start an operation that looks from a pose; its outcome comes to `_ended`."""
         rig, outcomes = self._rig, list[Outcome]()
-        self._left = False
+        self._moved = self._left = False
+        self._looking_from = pose
 
         def run(record: Callable[[Any], None], cancelled: threading.Event) -> TrackSighting:
             search = TargetSearch(
@@ -431,10 +435,11 @@ class Tracker:
             recorded, run, lambda operation: self._ended(operation, outcomes[0] if outcomes else None)
         )
 
-    def _begin_look(self, track: Track) -> Operation:
+    def _begin_look(self, status: TrackStatus, track: Track) -> Operation:
         """Start a look. Raises NotNow, Unable."""
-        found_by = self._status.found_by
-        operation = self._run({"track": self._status.id}, lambda search: search.find(track, found_by))
+        operation = self._run(
+            {"track": status.id}, lambda search: search.find(track, status.found_by), status.stands_at
+        )
         self._look_again = False
         return operation
 
@@ -443,7 +448,7 @@ class Tracker:
         if status.track is None or status.owed is not None:
             return status
         try:
-            return replace(status, operation=self._begin_look(status.track).id)
+            return replace(status, operation=self._begin_look(status, status.track).id)
         except MastctlError as error:  # a pointing runs, or the service is closing
             return replace(status, reason=f"not looked for yet: {error}")
 
@@ -518,37 +523,26 @@ class Tracker:
     def _taken(self, operation: Operation, outcome: Outcome | None) -> None:
         matched = None if outcome is None else outcome[1].matched
         with self._lock:
-            came = len(self._waiting)
-            left = self._left or self._left_by(self._waiting)
-            counts = self._status.operation == operation.id and self._status.state != "starting" and not left
+            counts = self._status.operation == operation.id and self._status.state != "starting"
+            counts = counts and not (self._left or self._moved)
         if matched is not None and counts:  # without the lock, for which a stop waits: it may take its time
             self._on_matched(matched)
         with self._lock:
             if self._status.operation != operation.id:
                 return  # stopped meanwhile
-            waiting, self._waiting = self._waiting, []
             status = replace(self._status, operation=None)
-            left = self._left_by(waiting[:came])
             if status.state == "starting":
-                status = self._started(status, operation, outcome, left or self._left)
-            elif self._left:
+                status = self._started(status, operation, outcome, self._left or self._moved)
+            elif self._left or status.owed is not None:
                 pass  # it is lost, with the reason
-            elif left:
+            elif self._moved:
                 reason = "the rover moved while the pictures were taken, so that they belong to no one pose"
                 status = replace(status, reason=reason)
             else:
-                status = self._looked(status, operation, outcome)
-            if status.state in ACTIVE:
-                for one in waiting:
-                    status = self._carry(status, one)
-                if self._look_again:
-                    status = self._looked_for(status)
+                status = self._looked(replace(status, stands_at=self._looking_from), operation, outcome)
+            if status.state in ACTIVE and self._look_again:
+                status = self._looked_for(status)
             self._publish(status)
-
-    def _left_by(self, poses: Sequence[RoverPose]) -> bool:
-        """Whether the rover left its pose by poses that came since."""
-        stood = self._status.stands_at
-        return stood is not None and any(not is_still(motion_between(stood, one)) for one in poses)
 
 
 def _why(operation: Operation) -> str:
