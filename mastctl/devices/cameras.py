@@ -1,8 +1,4 @@
-"""The cameras as the service uses them: one thread each, sets that belong together, with their facts.
-
-A frame gets the joint angles at its mid-exposure from the head's readings around it. An answer that cannot
-be true is an error.
-"""
+"""The cameras as the service uses them: one thread each, sets that belong together, with their facts."""
 
 from __future__ import annotations
 
@@ -62,8 +58,8 @@ class CameraControls:
     def change(self, name: str, wanted: Mapping[str, float]) -> list[str]:
         """Change some of a camera's settings; return a sentence for each that became another than wanted.
 
-        Raises BadSetting: for one that it lacks, cannot change, or that is out of its bounds; nothing has
-        changed then, but what the sentence names; NotNow ``busy`` if an operation keeps them; else as `of`.
+        Raises BadSetting for one that it lacks, cannot change, or that is out of its bounds; NotNow ``busy``
+        if an operation keeps them; else as `of`.
         """
         check_known(name, self._cameras)
 

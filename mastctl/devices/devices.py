@@ -140,8 +140,8 @@ class Devices(Cameras):
     def read(self) -> HeadReading:
         """Return the joint state measured now; what was not answered properly is tried once more.
 
-        Raises NoReply, BadReply, DriverError if the head does not answer in 1 s, both tries together, or
-        answers what cannot be true. The error is that of the first try.
+        Raises NoReply, BadReply, DriverError, of the first try, if the head does not answer in 1 s, or
+        answers what cannot be true.
         """
         return self._head.call("read", self._read_twice, READ_TIMEOUT_S)
 

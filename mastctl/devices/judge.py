@@ -23,7 +23,7 @@ from drivers.errors import BadOptions
 from drivers.interfaces import AxisMotion, PanTilt, Reading
 from mastctl.answers import SunTold
 from mastctl.control.machine import StandingFault
-from mastctl.devices.keep_out import Box, KeepOuts, KeptOut, Pair, Span
+from mastctl.devices.keep_out import Box, KeepOuts, Pair, Span
 from mastctl.errors import BadRequest
 
 
@@ -213,7 +213,7 @@ class _SentMove:
 class KeepOutJudge:
     """Limits, keep-outs and the sun; safe from any thread.
 
-    ``head`` may state how its axes move; ``device`` is its name, in errors. The sun's directions end by the
+    ``head`` may state how its ``axes`` move; ``device`` is its name. The sun's directions end by the
     ``clock``, and without a ``rig``, the mast file's content, none is kept out.
 
     Raises BadOptions if the head states that it speeds up faster than the limits allow.
@@ -231,16 +231,15 @@ class KeepOutJudge:
         self.limits = limits
         self._clock = clock
         self._device = device
-        self._stated: Mapping[str, AxisMotion] = head.info.motion
+        self.axes: Mapping[str, AxisMotion] = head.info.motion
         still = AxisMotion(ASSUMED_RAD_PER_S2)
-        pan, tilt = (self._stated.get(axis, still).beyond_goal_rad for axis in ("pan", "tilt"))
+        pan, tilt = (self.axes.get(axis, still).beyond_goal_rad for axis in ("pan", "tilt"))
         self._beyond = pan, tilt
         self._lock = threading.Lock()
         self._rig = rig
         self._sun = sun
         self._rover_from_site = np.eye(3)
         self._sun_boxes: tuple[Box, ...] = ()
-        self._boxes: tuple[KeepOuts | None, KeepOuts | None] = (None, None)  # without the sun, and with it
         self._sent: _SentMove | None = None
         self._inside_s: Mapping[str, float] = {}  # where the head stands and should not, and since when
         self.use_limits(limits)
@@ -248,25 +247,15 @@ class KeepOutJudge:
     @property
     def counts_rad(self) -> Mapping[str, float]:
         """One count of ``pan`` and of ``tilt``, as far as the head states it."""
-        return {axis: one.count_rad for axis, one in self._stated.items() if one.count_rad}
+        return {axis: one.count_rad for axis, one in self.axes.items() if one.count_rad}
 
     def turns_to(self, goal: Pair) -> tuple[int, int]:
         """Return from which side pan and tilt come to a reading by themselves: 1, -1, 0 for either."""
         pan, tilt = (
-            self._stated[axis].turn_to(to) if axis in self._stated else 0
+            self.axes[axis].turn_to(to) if axis in self.axes else 0
             for axis, to in zip(("pan", "tilt"), goal, strict=True)
         )
         return pan, tilt
-
-    @property
-    def axes(self) -> Mapping[str, AxisMotion]:
-        """How the axes move, where the head states it."""
-        return self._stated
-
-    @property
-    def sun(self) -> SunDirection | None:
-        """The direction that is kept out; also one that holds no longer."""
-        return self._sun
 
     def braking_rad(self, speed_rad_per_s: float) -> float:
         """Return how far an axis goes while it brakes from a speed."""
@@ -277,12 +266,12 @@ class KeepOutJudge:
 
         Raises BadOptions if the head states that it speeds up faster than these allow; nothing has changed.
         """
-        _check_acceleration(limits, self._stated, self._device)
+        _check_acceleration(limits, self.axes, self._device)
         assumed = limits.acceleration_rad_per_s2 or ASSUMED_RAD_PER_S2
         with self._lock:
             self.limits = limits
             self._braking_rad_per_s2 = min(
-                (axis.acceleration_rad_per_s2 for axis in self._stated.values()), default=assumed
+                (axis.acceleration_rad_per_s2 for axis in self.axes.values()), default=assumed
             )
             self._renew()
 
@@ -307,9 +296,7 @@ class KeepOutJudge:
     def check_goal(self, pan_rad: float, tilt_rad: float) -> None:
         """Pass joint angles that may be a goal. Raises OutsideLimits, KeptOut."""
         self.limits.check(pan_rad, tilt_rad)
-        keep_outs = self._now()
-        if keep_outs is not None:
-            keep_outs.check_goal((pan_rad, tilt_rad))
+        self._now().check_goal((pan_rad, tilt_rad))
 
     def check_from(self, start: Pair, goal: Pair) -> None:
         """Pass a goal to which a head that rests at ``start`` may be sent.
@@ -317,16 +304,13 @@ class KeepOutJudge:
         Raises OutsideLimits; KeptOut, which names the nearest free goal.
         """
         self.limits.check(*goal)
-        keep_outs = self._now()
-        if keep_outs is not None:
-            keep_outs.refuse_unless_free(Span.around(start), goal, True)
+        self._now().refuse_unless_free(Span.around(start), goal, True)
 
     def free_span(self, place: Pair) -> Span | None:
         """Return a free rectangle within the limits about a place, moved into them; None if kept out."""
-        limits, keep_outs = self.limits, self._now()
-        within = Span(limits.pan_rad, limits.tilt_rad)
+        limits = self.limits
         on = _into(place[0], limits.pan_rad), _into(place[1], limits.tilt_rad)
-        return within if keep_outs is None else keep_outs.free_span(on, within)
+        return self._now().free_span(on, Span(limits.pan_rad, limits.tilt_rad))
 
     def check_move(self, goal: Pair, read: Callable[[], Reading]) -> Span | None:
         """Pass a move to a goal within the limits that may go out now; return where it begins, for `sent`.
@@ -334,7 +318,7 @@ class KeepOutJudge:
         ``read`` measures the head, if anything is kept out. Raises KeptOut if the head might pass that.
         """
         keep_outs = self._now()
-        if keep_outs is None:
+        if not keep_outs.boxes:
             return None
         start, rests = self._start(read())
         keep_outs.refuse_unless_free(start, goal, rests)
@@ -358,19 +342,13 @@ class KeepOutJudge:
         at = reading.pan_rad, reading.tilt_rad
         goal = _into(goal[0], limits.pan_rad), _into(goal[1], limits.tilt_rad)
         keep_outs = self._now()
-        if keep_outs is None:
+        if not keep_outs.boxes:
             return goal
         start, rests = self._start(reading)
 
-        def free(place: Pair) -> bool:
-            try:
-                keep_outs.check_move(start, place, rests)
-            except KeptOut:
-                return False
-            return True
-
         def part(way: Callable[[float], Pair]) -> Pair | None:
-            return next((place for n in range(PARTS, 0, -1) if free(place := way(n / PARTS))), None)
+            places = (way(n / PARTS) for n in range(PARTS, 0, -1))
+            return next((place for place in places if keep_outs.allows(start, place, rests)), None)
 
         kept = stay or at
         (pan, tilt), (to_pan, to_tilt) = at, goal
@@ -392,9 +370,7 @@ class KeepOutJudge:
             found.append(StandingFault(SUN, "sun_not_known", message, sun.until_s, until))
         if reading is None:
             return tuple(found)
-        keep_outs = self._now()
-        at = Span.around((reading.pan_rad, reading.tilt_rad))
-        holding = () if keep_outs is None else keep_outs.holding(at)
+        holding = self._now().holding(Span.around((reading.pan_rad, reading.tilt_rad)))
         before_s = self._inside_s
         self._inside_s = {box.name: before_s.get(box.name, reading.time_s) for box in holding}
         for name, since_s in self._inside_s.items():
@@ -412,7 +388,7 @@ class KeepOutJudge:
         A head that is in it and goes out is let go.
         """
         keep_outs, sent = self._now(), self._sent
-        if keep_outs is None or sent is None or reading is None:
+        if sent is None or reading is None:
             return None
         start, rests = self._start(reading)
         if rests:
@@ -461,8 +437,8 @@ class KeepOutJudge:
     def _round(self, goal: Pair) -> Span:
         return Span.around(goal).grown(self._beyond[0], self._beyond[1])
 
-    def _now(self) -> KeepOuts | None:
-        """What is kept out at this moment; None for nothing."""
+    def _now(self) -> KeepOuts:
+        """What is kept out at this moment."""
         sun = self._sun
         return self._boxes[sun is not None and sun.holds(self._clock.now_s())]
 
@@ -472,7 +448,6 @@ class KeepOutJudge:
         slack = limits.margin_rad + self._beyond[1]
         # A copy of each box for every turn that the pan reaches, and for where a hand may have pushed it.
         reach = limits.pan_rad[0] - np.pi, limits.pan_rad[1] + np.pi
-        made = []
         plain: list[Box] = [copy for box in limits.keep_out for copy in box.within(reach)]
         with_sun = list(plain)
         self._sun_boxes = ()
@@ -488,10 +463,8 @@ class KeepOutJudge:
             ]
             self._sun_boxes = tuple(rows)
             with_sun += [copy for box in rows for copy in box.within(reach)]
-        for boxes in (plain, with_sun):
-            whole = KeepOuts(tuple(boxes), limits.margin_rad, self._beyond, limits.pan_rad, limits.tilt_rad)
-            made.append(whole if boxes else None)
-        self._boxes = made[0], made[1]
+        within = limits.margin_rad, self._beyond, limits.pan_rad, limits.tilt_rad
+        self._boxes = [KeepOuts(tuple(boxes), *within) for boxes in (plain, with_sun)]
 
 
 def _into(value: float, limits: Pair) -> float:

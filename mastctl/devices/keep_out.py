@@ -215,9 +215,10 @@ class KeepOuts:
             lines.append([edge for edge in edges if limits[0] <= edge <= limits[1]])
         places = ((pan, tilt) for pan in lines[0] for tilt in lines[1])
         by_distance = sorted(places, key=lambda one: (math.dist(one, goal), one))
-        return next((one for one in by_distance if self._allows(start, one, rests)), None)
+        return next((one for one in by_distance if self.allows(start, one, rests)), None)
 
-    def _allows(self, start: Span, goal: Pair, rests: bool) -> bool:
+    def allows(self, start: Span, goal: Pair, rests: bool) -> bool:
+        """Return whether `check_move` passes a move."""
         try:
             self.check_move(start, goal, rests)
         except KeptOut:

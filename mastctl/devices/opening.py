@@ -50,9 +50,7 @@ def open_rig(settings: HardwareSettings, clock: Clock) -> tuple[Hardware, StateF
     """Take the place of the head, then open all devices; return both, to be closed by the caller.
 
     The place is None for a head in memory, and for one that says it is simulated: it is as good as in memory.
-
-    Raises StateInUse if another program drives the head; DriverError: as
-    `drivers.open_hardware.open_hardware`.
+    Raises StateInUse if another program drives the head; DriverError.
     """
     with ExitStack() as undo:
         name = head_name(settings)
@@ -76,8 +74,7 @@ def devices_beside(
     are judged, and the cameras; with ``own_cameras`` the caller alone takes images.
 
     Raises Estopped if the head is to be moved and its emergency stop is latched (nothing was opened);
-    StateInUse if another program drives the head; DriverError: as
-    `drivers.open_hardware.open_hardware`.
+    StateInUse if another program drives the head; DriverError.
     """
     stored = bounds.stored
     assert stored is not None

@@ -117,12 +117,10 @@ class DeviceThread:
         return call
 
     def wait(self, call: ThreadCall[T], deadline_s: float, check: Check | None = None) -> T:
-        """Return a call's result, waiting until ``deadline_s`` (of the clock) at most.
+        """Return a call's result, or raise its error, waiting until ``deadline_s`` (of the clock) at most.
 
-        ``check`` is called meanwhile, every `CHECKED_S`; what it raises ends the wait.
-
-        Raises NoReply if it did not end in time: it will not begin any more, or its late result will be
-        dropped; DriverError, MastctlError: whatever of these it raised.
+        ``check`` is called meanwhile, every `CHECKED_S`; what it raises ends the wait. Raises NoReply if it
+        did not end in time: it will not begin any more, or its late result will be dropped.
         """
         with self._wake:
             while not call.future.done():
@@ -153,8 +151,7 @@ class DeviceThread:
     def call(self, what: str, function: Callable[[], T], timeout_s: float, *, noted: bool = True) -> T:
         """Run ``function`` in the thread and return its result within ``timeout_s`` seconds.
 
-        Raises NoReply if it did not end in time; DriverError, MastctlError: whatever of these ``function``
-        raises; any other exception comes as a DriverError.
+        Raises NoReply if it did not end in time; what ``function`` raises, as a DriverError or MastctlError.
         """
         deadline_s = self._clock.now_s() + timeout_s
         return self.wait(self.submit(what, function, timeout_s, noted=noted), deadline_s)
@@ -165,10 +162,7 @@ class DeviceThread:
             return dict(self._errors)
 
     def faults(self) -> tuple[StandingFault, ...]:
-        """Return what is wrong at this moment; a call that succeeds takes back its own earlier fault.
-
-        It also takes back every call's lost line.
-        """
+        """Return what is wrong; a call that succeeds takes back its own fault, and every lost line."""
         faults = dict(self._faults)
         now = self._now
         overdue = self._overdue(now)
@@ -177,10 +171,7 @@ class DeviceThread:
         return tuple(faults.values())
 
     def end(self) -> None:
-        """Have the thread end; waits for nothing.
-
-        Waiting calls are refused, except those that go ``first``: they still go out before the end.
-        """
+        """Have the thread end, without waiting; calls that wait are refused, but those that go ``first``."""
         with self._wake:
             self._closing = True
             for call in self._jobs:
@@ -407,8 +398,8 @@ class StopRequests:
     def send(self, timeout_s: float) -> None:
         """Stop the head and return when that is confirmed, by this stop or by another on its way.
 
-        Raises NoReply if no stop was confirmed within ``timeout_s`` seconds; the head may still move;
-        DriverError, MastctlError if the driver refused it.
+        Raises NoReply if no stop was confirmed within ``timeout_s`` seconds, DriverError, MastctlError if the
+        driver refused it; the head may still move.
         """
         try:
             with self._clock.at_work():  # a simulation's second does not pass before the stop is queued

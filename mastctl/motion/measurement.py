@@ -220,8 +220,7 @@ class RigCameras:
     def again(self, view: CameraView, pixel_px: FloatArray, now: CameraView) -> PatchMatch:
         """Find a clicked pixel in a new frame of the same camera, before its range is known.
 
-        Raises PointingError ``not_in_view`` if the head has turned away since, ``target_...`` if the match is
-        not good.
+        Raises PointingError ``not_in_view`` if the head has turned away since, ``target_...``.
         """
         settings = self._settings
         turned = max(
@@ -249,8 +248,7 @@ class RigCameras:
     def stereo(self, view: CameraView, pixel_px: FloatArray, other: CameraView) -> StereoMatch:
         """Find the other camera's pixel along the epipolar line.
 
-        Raises PointingError ``target_...`` if the match is not good, ``eyes_disagree`` if it lies off the
-        line.
+        Raises PointingError ``target_...``, ``eyes_disagree`` if it lies off the line.
         """
         settings = self._settings
         found = find_partner(view, pixel_px, other, settings.nearest_m, settings.match)
@@ -268,7 +266,7 @@ class RigCameras:
     def find(self, clicked: Clicked, now: CameraView) -> PatchMatch:
         """Find the clicked thing in a new view: near where it should be, then further around.
 
-        Raises PointingError ``target_...`` if no match is good.
+        Raises PointingError ``target_...``.
         """
         settings = self._settings
         planes = [clicked.plane, *clicked.others]

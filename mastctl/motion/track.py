@@ -117,37 +117,13 @@ def _clock_was_set(pose: RoverPose, before: RoverPose) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class TrackStatus:
-    """The track at one moment.
+    """The track at one moment; ``sequence`` grows with each change.
 
-    Attributes
-    ----------
-    sequence
-        Grows with each change.
-    reason
-        One sentence says why; empty where nothing needs to be said.
-    id
-        The operation that started the track.
-    predicted
-        Whether the rover moved since the last look: the position is carried over, not seen.
-    track
-        What is followed, or was, in the rover frame of ``stands_at``; None before the first images.
-    stands_at
-        The pose that the track was carried to; None before the first pose.
-    owed
-        Covariance (6, 6) of the motions since then, and the pose up to which they go, if poses came that the
-        track was not carried to; else None.
-    pose
-        The newest pose. It is another than ``stands_at`` after a pose that jumped, and while a look runs.
-    seen
-        What the last look saw.
-    found_by
-        The pair that found the target last.
-    renewals
-        How often the key picture was renewed.
-    operation
-        The running start or look.
-    changed_s
-        When this became so, seconds of CLOCK_MONOTONIC.
+    ``reason`` is one sentence, where one is needed. ``id`` is the operation that started the track,
+    ``operation`` the running start or look. ``track`` is what is followed, or was, in the rover frame of
+    ``stands_at``, the pose that it was carried to; ``predicted`` says that the rover moved since it was seen.
+    ``pose`` is the newest; if it jumped, ``owed`` has the covariance (6, 6) of the motions up to it since
+    ``stands_at``. ``seen`` is what the last look saw, ``found_by`` the pair that found the target last.
     """
 
     sequence: int = 0
@@ -163,7 +139,7 @@ class TrackStatus:
     found_by: str = ""
     looks: int = 0
     handoffs: tuple[Handover, ...] = ()
-    renewals: int = 0
+    renewals: int = 0  # of the key picture
     operation: str | None = None
     changed_s: float = 0.0
 
@@ -243,11 +219,10 @@ class TrackStatus:
 class Tracker:
     """At most one track, and the rover's pose; safe to use from any thread, never blocks for a device.
 
-    ``rig``, ``limits``: the part of the mast file in use that is configured, and the head's limits.
-    ``on_matched``: gets each hand-off's record, in the operation's thread; it may take its time. ``machine``:
-    gets the begin and the end of a track; its publisher each change of it. One of its own by default.
-
-    ``moved_s``: when the newest pose that moved the rover came, seconds of CLOCK_MONOTONIC; None before.
+    ``rig`` is the configured part of the mast file in use. ``on_matched`` gets each hand-off's record, in the
+    operation's thread; it may take its time. ``machine`` gets the begin and the end of a track, its publisher
+    each change of it. ``moved_s`` is when the newest pose that moved the rover came, seconds of
+    CLOCK_MONOTONIC; None before.
     """
 
     def __init__(

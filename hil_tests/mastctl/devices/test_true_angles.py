@@ -102,7 +102,7 @@ def test_a_goal_near_the_turnover_counts_the_side_of_approach(
 ) -> None:
     bench = Bench()
     hangs = AxisMotion(1.0, rising_below_rad=turnover_rad)
-    bench.devices.judge._stated = {"pan": AxisMotion(1.0), "tilt": hangs}
+    bench.devices.judge.axes = {"pan": AxisMotion(1.0), "tilt": hangs}
     for past_rad in (-0.007, -0.003, 0.003, 0.007):  # from it, in readings: the true angle is 5 mrad away
         wanted_rad = TOLD.tilt.true_rad(turnover_rad + past_rad)
         assert abs(wanted_rad - turnover_rad - past_rad) > 0.003, "there is something to mistake"
