@@ -271,10 +271,6 @@ def build_model(
     for letter in "AO":
         if letter in arrays and np.linalg.norm(arrays[letter]) < 1e-6:
             raise BadFile(path, at(letter), f"{arrays[letter].tolist()} where a unit vector is expected")
-    rows = np.array([arrays[letter] for letter in "AHV"])
-    norms = np.linalg.norm(rows, axis=1, keepdims=True)
-    if norms.min() < 1e-9 or abs(np.linalg.det(rows / norms)) < 1e-12:
-        raise BadFile(path, place, "A, H and V lie in one plane; no image can be formed")
     if not 0 < min(size_px) <= max(size_px) <= LARGEST_IMAGE_PX:
         raise BadFile(
             path, at("size_px"), f"{list(size_px)} where 1 to {LARGEST_IMAGE_PX} pixels are expected"

@@ -7,11 +7,10 @@ cameras are good to 20 cm and 10 degrees, and so is this. Cameras without a roug
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import Executor, as_completed
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -47,41 +46,27 @@ def detect_survey(
     in this thread; the result does not depend on it. ``progress`` is called after each image, in this thread.
     """
     expected = expectations(survey)
-    tasks = {
-        image.name: (
-            survey.folder / image.file,
-            survey.cameras[image.camera].size_px,
-            survey.board,
-            expected[image.name],
-        )
-        for image in survey.images
-        if image.name not in survey.dots and image.file != Path()
-    }
-    found = dict(survey.dots)
-    failures: dict[str, str] = {}
-    for count, (name, result) in enumerate(_found(tasks, executor), 1):
+    images = [i for i in survey.images if i.name not in survey.dots and i.file != Path()]
+    tasks = [
+        (survey.folder / i.file, survey.cameras[i.camera].size_px, survey.board, expected[i.name])
+        for i in images
+    ]
+    found, failures = dict(survey.dots), dict[str, str]()
+    results = map(_find, tasks) if executor is None else executor.map(_find, tasks)
+    for count, (image, result) in enumerate(zip(images, results, strict=True), 1):
         if isinstance(result, Dots):
-            found[name] = result
+            found[image.name] = result
         else:
-            failures[name] = result.reason
+            failures[image.name] = result.reason
         if progress is not None:
-            progress(count, len(tasks), name)
-    names = [image.name for image in survey.images]
-    return SurveyDots(
-        {name: found[name] for name in names if name in found},
-        {name: failures[name] for name in names if name in failures},
-    )
+            progress(count, len(tasks), image.name)
+    return SurveyDots({i.name: found[i.name] for i in survey.images if i.name in found}, failures)
 
 
-def _found(
-    tasks: Mapping[str, tuple[Any, ...]], executor: Executor | None
-) -> Iterator[tuple[str, Dots | CornersNotFound]]:
-    """Yield each image's name and what is found in it, as it comes."""
-    if executor is None:
-        yield from ((name, find_in_file(*task)) for name, task in tasks.items())
-        return
-    futures = {executor.submit(find_in_file, *task): name for name, task in tasks.items()}
-    yield from ((futures[future], future.result()) for future in as_completed(futures))
+def _find(
+    task: tuple[Path, tuple[int, int], Board, PredictedBoard | Upright | None],
+) -> Dots | CornersNotFound:
+    return find_in_file(*task)
 
 
 def find_in_file(

@@ -25,7 +25,6 @@ from calib.geometry.stereo import triangulate
 from calib.matching.partner import find_partner
 from calib.matching.patch import match_patch
 from calib.matching.warp import Plane, PosedImage, facing_plane
-from calib.survey.alignment import NotAligned, align, mirrored
 from calib.survey.find_dots import find_in_file
 from calib.targets.boards import Dots
 from calib.targets.dots import PredictedBoard
@@ -110,27 +109,6 @@ def test_models_that_look_past_each_other_are_not_alike() -> None:
     )
     assert pytest.approx(np.linalg.norm(partly.rotation_rad)) == 1.2
     assert 0 < np.isinf(partly.shift_px[:, 0]).sum() < len(partly.shift_px)
-
-
-@pytest.mark.parametrize("sigma", [0.0, -1e-3, math.nan, math.inf])
-def test_points_without_a_sigma_are_not_aligned(sigma: float) -> None:
-    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    with pytest.raises(ValueError, match=r"sigma_m is .* above 0"):
-        align(points, points, sigma, list("abcd"))
-    with pytest.raises(ValueError, match=r"sigma_m is .* above 0"):
-        mirrored(points, points, sigma)
-
-
-@pytest.mark.parametrize("bad", NO_NUMBERS)
-def test_a_point_that_is_nowhere_is_named(bad: float) -> None:
-    points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    off = points.copy()
-    off[2, 1] = bad
-    for pair in ((points, off), (off, points)):
-        with pytest.raises(NotAligned, match="point c is at"):
-            align(*pair, 1e-3, list("abcd"))
-    with pytest.raises(ValueError, match="do not go together"):
-        align(points, points[:3], 1e-3, list("abcd"))
 
 
 @pytest.mark.parametrize("bad", [*NO_NUMBERS, -0.1])
