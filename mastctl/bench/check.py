@@ -118,8 +118,8 @@ def _point(
     """Bring one corner to the middle of the first camera's image; None where that cannot be tried."""
     rig, cameras, head = known.now.rig, known.workspace.cameras, mast.head
     sides = look.pan_approach, look.tilt_approach
-    true_rad = [rig.joints.true_rad((seen[name].pan_rad, seen[name].tilt_rad), sides) for name in cameras]
-    models = [rig.camera_in_rover(name, *at) for name, at in zip(cameras, true_rad, strict=True)]
+    pan_rad, tilt_rad = rig.joints.true_rad((look.pan_rad, look.tilt_rad), sides)
+    models = [rig.camera_in_rover(name, pan_rad, tilt_rad) for name in cameras]
     pixels = [_pixel(seen[name], corner) for name in cameras]
     model = rig.cameras[cameras[0]].model
     try:
@@ -129,7 +129,7 @@ def _point(
             ray = models[0].ray(pixels[0])
             (by_fit_m,) = known.now.boards[placement].points(known.board.in_board_m(np.array([corner])))
             point = ray.origins_m + ray.directions * float(np.linalg.norm(by_fit_m - ray.origins_m))
-        found = solve(rig.mast, model, point, from_pan_rad=true_rad[0][0], from_tilt_rad=true_rad[0][1])
+        found = solve(rig.mast, model, point, from_pan_rad=pan_rad, from_tilt_rad=tilt_rad)
         angles = choose(
             found, head.pan_limits_rad, head.tilt_limits_rad, look.pan_rad, look.tilt_rad,
             read=lambda one: rig.joints.read_rad((one.pan_rad, one.tilt_rad)),
@@ -138,7 +138,7 @@ def _point(
         return None
     sides = (0, 0)
     if not head.one_sided:
-        sides = (1 if angles.pan_rad > true_rad[0][0] else -1, 1 if angles.tilt_rad > true_rad[0][1] else -1)
+        sides = (1 if angles.pan_rad > pan_rad else -1, 1 if angles.tilt_rad > tilt_rad else -1)
     try:
         landed = mast.look(*rig.joints.read_rad((angles.pan_rad, angles.tilt_rad), sides), sides)
     except NotThere:
@@ -147,7 +147,7 @@ def _point(
     if again is None or again.corners is None or corner not in again.corners.ids:
         return None
     x, y = _pixel(again, corner) - np.asarray(model.image_center_px)
-    turned_rad = math.hypot(angles.pan_rad - true_rad[0][0], angles.tilt_rad - true_rad[0][1])
+    turned_rad = math.hypot(angles.pan_rad - pan_rad, angles.tilt_rad - tilt_rad)
     promised_px = math.hypot(known.predicted_px(), known.counts_px, math.sqrt(2.0) * known.sought.sigma_px)
     range_m = float(np.linalg.norm(point - models[0].C))
     return CornerPointing(corner, range_m, math.degrees(turned_rad), (float(x), float(y)), promised_px)

@@ -32,7 +32,7 @@ from calib.survey.records import Survey
 from calib.targets.boards import AnyBoard
 from mastctl.answers import MOST_CELLS, BenchProgress, Coverage
 from mastctl.bench.mast import BenchHead, BenchLook
-from mastctl.bench.survey import RunFolder, fit_in_frame, frame_of, looks_of, moved_placements
+from mastctl.bench.survey import RunFolder, fit_in_frame, looks_of, moved_placements, stated_mast
 from mastctl.calibration.landing import first_cameras
 
 USUAL_PAN_RAD, USUAL_TILT_RAD = (-1.2, 1.2), (-0.9, 0.3)
@@ -257,7 +257,7 @@ class BenchKnowledge:
 
     def _fit(self, survey: Survey) -> BenchCalibration:
         notes = self.kept.notes
-        return fit_in_frame(survey, frame_of(notes), self.head.rig, moved_placements(notes))
+        return fit_in_frame(survey, stated_mast(notes), self.head.rig, moved_placements(notes))
 
     def _use(self, fitted: BenchCalibration, looks: int) -> None:
         """Let a fit of so many looks be the present estimate; boards that it does not know stay where they
@@ -284,9 +284,8 @@ class BenchKnowledge:
         """Where the board is, by the picture that shows most of it."""
         one = max(look.found, key=lambda seen: 0 if seen.corners is None else len(seen.corners))
         assert one.corners is not None
-        true_rad = self.now.rig.joints.true_rad(
-            (one.pan_rad, one.tilt_rad), (look.pan_approach, look.tilt_approach)
-        )
+        sides = look.pan_approach, look.tilt_approach
+        true_rad = self.now.rig.joints.true_rad((look.pan_rad, look.tilt_rad), sides)
         in_board_m = self.board.in_board_m(one.corners.ids)
         return rover_from_board(self.now.rig, one.camera, *true_rad, in_board_m, one.corners.pixels_px)
 

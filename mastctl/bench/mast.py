@@ -76,15 +76,12 @@ class NoLight(BenchInterrupted):
 
 @dataclass(frozen=True, eq=False)
 class SeenBoard:
-    """One camera's image of a look.
+    """One camera's image of a look: ``corners`` of the board, or None and ``why`` there are none.
 
-    ``pan_rad``, ``tilt_rad``: what the joints read at mid-exposure; ``corners`` of the board, or None and
-    ``why`` there are none; ``data``: the image's file, PNG, empty where only corners are simulated.
+    ``data``: the image's file, PNG, empty where only corners are simulated.
     """
 
     camera: str
-    pan_rad: float
-    tilt_rad: float
     corners: Corners | None
     why: str = ""
     data: bytes = b""
@@ -92,23 +89,18 @@ class SeenBoard:
 
 @dataclass(frozen=True, eq=False)
 class BenchLook:
-    """Cameras' images at one attitude, from which side each joint came (1, -1, 0 unknown), and how long it
-    took, seconds of the rover's clock."""
+    """Cameras' images at one attitude at rest: what the joints read, radians, the cameras' mean.
+
+    Each joint came from smaller angles (1), from larger (-1), or it is unknown (0). It took ``seconds`` of
+    the rover's clock.
+    """
 
     seen: tuple[SeenBoard, ...]
-    pan_approach: int
-    tilt_approach: int
-    seconds: float
-
-    @property
-    def pan_rad(self) -> float:
-        """What pan read, the cameras' mean."""
-        return sum(one.pan_rad for one in self.seen) / len(self.seen)
-
-    @property
-    def tilt_rad(self) -> float:
-        """What tilt read, the cameras' mean."""
-        return sum(one.tilt_rad for one in self.seen) / len(self.seen)
+    pan_rad: float
+    tilt_rad: float
+    pan_approach: int = 0
+    tilt_approach: int = 0
+    seconds: float = 0.0
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -238,14 +230,14 @@ class DaemonMast:
         seconds = self._now_s() - begun_s
         if any(shot.moving for shot in shots.values()):
             raise ClientError("moving", "the head moved while the pictures were taken")
-        one = next(iter(shots.values()))
-        seen = [
-            found[name].result()
-            if name in found
-            else SeenBoard(name, one.pan_rad, one.tilt_rad, None, _without_picture(name, failed[name]))
+        seen = tuple(
+            found[name].result() if name in found else SeenBoard(name, None, _no_picture(name, failed[name]))
             for name in names
-        ]
-        return BenchLook(tuple(seen), _side(one.pan_approach), _side(one.tilt_approach), seconds)
+        )
+        pan_rad, tilt_rad = np.mean([(one.pan_rad, one.tilt_rad) for one in shots.values()], axis=0).tolist()
+        one = next(iter(shots.values()))
+        sides = _side(one.pan_approach), _side(one.tilt_approach)
+        return BenchLook(seen, pan_rad, tilt_rad, *sides, seconds)
 
     def _turn(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int]) -> None:
         """Go to readings, by way of ones beside them where an axis would come from the other side.
@@ -304,7 +296,7 @@ class DaemonMast:
             corners = None
         else:
             corners, reason = found, ""
-        return SeenBoard(shot.camera, shot.pan_rad, shot.tilt_rad, corners, reason, shot.data)
+        return SeenBoard(shot.camera, corners, reason, shot.data)
 
     def _now_s(self) -> float:
         return float(self._client.status()["now_s"])
@@ -363,7 +355,7 @@ def _unlit(error: ClientError) -> bool:
     return (error.detail or {}).get("light") is not None
 
 
-def _without_picture(camera: str, error: ClientError) -> str:
+def _no_picture(camera: str, error: ClientError) -> str:
     """Why there is no picture of a camera beside another one's."""
     return str(error).removeprefix(f"{camera}: ") if _unlit(error) else f"camera {camera} gave no picture"
 

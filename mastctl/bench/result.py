@@ -16,7 +16,7 @@ from calib.survey.records import Survey
 from mastctl.as_json import as_json
 from mastctl.bench.check import Checked
 from mastctl.bench.run import BenchRun, Reporter
-from mastctl.bench.survey import RoverFrame, fit_in_frame
+from mastctl.bench.survey import fit_in_frame
 from mastctl.calibration.drawn import cells_seen
 from mastctl.calibration.landing import expected_pointing
 from mastctl.calibration.mast_file import fit_document, picked, with_fit
@@ -139,7 +139,7 @@ def fit_again(
     survey: Survey,
     out: Path,
     report: Path | None,
-    frame: RoverFrame,
+    mast_at: Sequence[float] | None,
     former: Rig | None,
     moved: Mapping[str, float],
 ) -> BenchDone:
@@ -149,7 +149,7 @@ def fit_again(
     is written then.
     """
     checked_survey(survey)
-    fit = fit_in_frame(survey, frame, former, moved)
+    fit = fit_in_frame(survey, mast_at, former, moved)
     cameras = Counter(image.camera for image in fit.images if image.purpose != "check")
     expected = expected_pointing(fit)
     numbers = {

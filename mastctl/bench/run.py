@@ -34,7 +34,7 @@ from mastctl.bench.mast import (
     SimulatedBoard,
 )
 from mastctl.bench.search import find_board
-from mastctl.bench.survey import RoverFrame, RunFolder
+from mastctl.bench.survey import RunFolder
 from mastctl.client import Client
 from mastctl.errors import MastctlError
 
@@ -330,7 +330,7 @@ def open_run(
     reporter: Reporter,
     wanted: BenchGoal,
     cameras: Sequence[str] = (),
-    frame: RoverFrame | None = None,
+    mast_at: Sequence[float] | None = None,
 ) -> BenchRun:
     """Return a run on a daemon's head, which ``client`` may steer, with a new or former survey ``folder``.
 
@@ -342,7 +342,7 @@ def open_run(
     head = mast.head
     sigma = Sigma(0.0, 0.0, joint_rad=head.count_rad / 12**0.5, corner_px=0.1)
     kept = RunFolder(folder, board, sigma, head.rig)
-    kept.begin(client.mast_file(), frame or RoverFrame())
+    kept.begin(client.mast_file(), mast_at)
     simulated = SimulatedBoard(client, board, head.rig) if status["simulated"] else None
     return BenchRun(mast, kept, board, reporter, wanted, simulated)
 

@@ -1,7 +1,7 @@
 """A run's survey: its folder with all that was seen and a journal, and the fit in the rover frame.
 
 No board of unknown place shows where the rover frame is: the mast stays where the former mast file has it,
-unless a `RoverFrame` states something else.
+unless a level and a tape show another place.
 """
 
 from __future__ import annotations
@@ -11,12 +11,11 @@ import json
 import os
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calib.adjust.result import BenchCalibration
 from calib.calibrate.bench import fit_bench
@@ -25,14 +24,11 @@ from calib.errors import BadFile
 from calib.files import replace_bytes
 from calib.files.mast_file import load_rig
 from calib.geometry.rig import Mast, Rig
-from calib.geometry.rigid import Rigid
 from calib.plan.placements import FEWEST, Placement
 from calib.survey.records import Approach, Sigma, Survey, SurveyCamera, SurveyImage
 from calib.survey.writer import BenchFolder, NotWritten
 from calib.targets.boards import AnyBoard
 from mastctl.bench.mast import BenchLook, SeenBoard
-from mastctl.calibration.landing import implied_motion
-from mastctl.errors import MastctlError
 from mastctl.json_lines import append_line
 
 JOURNAL = "bench.jsonl"
@@ -43,36 +39,13 @@ BOARD = "board"
 FORMER = "former_mast.yaml"
 """The mast file that was in use when the run began."""
 
-UPRIGHT = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""rover_from_board of a board that stands upright and shows its face to the rover: its x is the rover's y."""
 
+def stated_mast(notes: Sequence[Mapping[str, Any]]) -> Sequence[float] | None:
+    """Return where the mast stands at zero angles by a run's journal; None: as in the former mast file.
 
-class NoSuchFrame(MastctlError):
-    """The object that should define the rover frame is missing."""
-
-    code = "no_such_frame"
-    exit_code = 2
-
-
-@dataclass(frozen=True)
-class RoverFrame:
-    """What fixes the rover frame: one of these, or where the former mast file has the mast.
-
-    ``mast_at``: the mast at zero angles, by a level and a tape: x, y, z, metres, and three angles, radians,
-    as in a mast file. ``board_at``: the board of the first placement: x, y, z of its middle, metres, and yaw,
-    pitch, roll, degrees, about the rover's z, y, x; 0 0 0: upright, its face to the rover. ``body``: body
-    cameras stay where the former mast file has them.
+    That is x, y, z, metres, and three angles, radians, as in a mast file.
     """
-
-    mast_at: Sequence[float] | None = None
-    board_at: Sequence[float] | None = None
-    body: bool = False
-
-
-def frame_of(notes: Sequence[Mapping[str, Any]]) -> RoverFrame:
-    """Return what fixes the frame by a run's journal."""
-    note: Mapping[str, Any] = next((note for note in reversed(notes) if note.get("event") == "frame"), {})
-    return RoverFrame(note.get("mast_at"), note.get("board_at"), bool(note.get("body")))
+    return next((note.get("mast_at") for note in reversed(notes) if note.get("event") == "frame"), None)
 
 
 class RunFolder:
@@ -95,16 +68,16 @@ class RunFolder:
             number = _number_of(image, path)
             self._numbers[image.placement] = max(number, self._numbers.get(image.placement, 0))
 
-    def begin(self, former: bytes, frame: RoverFrame) -> None:
-        """Keep the mast file in use, unless one is kept already, and what the rover frame hangs on."""
+    def begin(self, former: bytes, mast_at: Sequence[float] | None) -> None:
+        """Keep the mast file in use, unless one is kept already, and where the mast stands if stated."""
         path = self.path / FORMER
         try:
             if not path.exists():
                 replace_bytes(path, former, 0o644)
         except OSError as error:
             raise NotWritten(path, "", f"cannot be written: {error.strerror or error}") from None
-        if frame not in (RoverFrame(), frame_of(self.notes)):
-            self.note(event="frame", **{key: value for key, value in asdict(frame).items() if value})
+        if mast_at is not None and list(mast_at) != stated_mast(self.notes):
+            self.note(event="frame", mast_at=list(mast_at))
 
     def survey(self) -> Survey:
         """Return all that was seen."""
@@ -132,7 +105,7 @@ class RunFolder:
                 setup="",
                 placement=placement,
                 purpose="check" if check else "mast" if on_head else "camera",
-                pan_rad=look.pan_rad if on_head else None,  # at rest: one reading for all cameras
+                pan_rad=look.pan_rad if on_head else None,
                 tilt_rad=look.tilt_rad if on_head else None,
                 file=Path("images") / f"{name}.png" if one.data else Path(),
                 row=0,
@@ -209,11 +182,11 @@ def looks_of(survey: Survey) -> Iterator[tuple[str, bool, BenchLook]]:
         if image.name in survey.corners:
             groups.setdefault(_look_name(image), []).append(image)
     for images in groups.values():
-        seen = tuple(
-            SeenBoard(i.camera, i.pan_rad or 0.0, i.tilt_rad or 0.0, survey.corners[i.name]) for i in images
-        )
+        seen = tuple(SeenBoard(i.camera, survey.corners[i.name]) for i in images)
         head = next((i for i in images if i.pan_rad is not None), images[0])
-        look = BenchLook(seen, head.pan_approach, head.tilt_approach, 0.0)
+        look = BenchLook(
+            seen, head.pan_rad or 0.0, head.tilt_rad or 0.0, head.pan_approach, head.tilt_approach
+        )
         yield images[0].placement, images[0].purpose == "check", look
 
 
@@ -254,26 +227,28 @@ def read_notes(folder: Path) -> list[dict[str, Any]]:
     return notes
 
 
-def rover_from_board(board_at: Sequence[float]) -> Rigid:
-    """Return the pose of a board that is stated in metres and degrees (see `RoverFrame`)."""
-    turn = Rotation.from_euler("ZYX", board_at[3:], degrees=True).as_matrix()
-    return Rigid(turn @ UPRIGHT, np.array(board_at[:3]))
-
-
 def fit_in_frame(
     survey: Survey,
-    frame: RoverFrame,
+    mast_at: Sequence[float] | None,
     former: Rig | None,
     moved: Mapping[str, float] | None = None,
 ) -> BenchCalibration:
-    """Fit a bench in the rover frame that was stated; ``former`` is the rig as it was known before.
+    """Fit a bench with the mast where `stated_mast` has it, else where the ``former`` rig has it.
 
     ``moved`` as of `moved_placements`: where the fit does not find out what moved when, it does without them.
-    Raises NoSuchFrame if the frame hangs on something that is missing, BenchNotFitted if the images do not
-    determine a rig.
+    Raises BenchNotFitted if the images do not determine a rig.
     """
+    place = None if former is None else former.mast.rover_from_mast
+    if mast_at is not None:
+        place = Mast(np.array(mast_at[:3]), np.array(mast_at[3:])).rover_from_mast
+
+    def fitted(survey: Survey) -> BenchCalibration:
+        survey, notes = without_lonely(survey)
+        done = fit_bench(survey) if place is None else fit_bench(survey, rover_from_mast=place)
+        return replace(done, notes=(*done.notes, *notes))
+
     try:
-        return _fit_in_frame(survey, frame, former)
+        return fitted(survey)
     except SomethingChanged:
         raise
     except BenchNotFitted as reason:
@@ -287,59 +262,12 @@ def fit_in_frame(
         ]
         corners = {i.name: survey.corners[i.name] for i in rest if i.name in survey.corners}
         try:
-            done = _fit_in_frame(replace(survey, images=rest, corners=corners), frame, former)
+            done = fitted(replace(survey, images=rest, corners=corners))
         except BenchNotFitted:
             raise BenchNotFitted(
                 f"{'; '.join(sentences)}, and what is left is too little: {reason}"
             ) from None
         return replace(done, notes=(*done.notes, *sentences, f"with these, {reason}"))
-
-
-def _fit_in_frame(survey: Survey, frame: RoverFrame, former: Rig | None) -> BenchCalibration:
-    """The fit of what a survey shows."""
-    survey, notes = without_lonely(survey)
-    stated: dict[str, Any] = {}
-    if frame.mast_at is not None:
-        place = Mast(np.array(frame.mast_at[:3]), np.array(frame.mast_at[3:])).rover_from_mast
-        stated = {"rover_from_mast": place}
-    elif frame.board_at is not None:
-        first = next((i for i in survey.images if i.name in survey.corners), None)
-        if first is None:
-            raise BenchNotFitted("no picture shows a board, and the rover frame should hang on the first")
-        known = (first.board, first.placement), rover_from_board(frame.board_at)
-        stated = {"rover_from_board": known}
-    elif former is not None:
-        stated = {"rover_from_mast": former.mast.rover_from_mast}
-    done = fit_bench(survey, **stated)
-    if frame.body:
-        place, sentence = _by_body(done, former)
-        done = fit_bench(survey, rover_from_mast=place)
-        notes = (*notes, sentence)
-    return replace(done, notes=(*done.notes, *notes))
-
-
-def _by_body(done: BenchCalibration, former: Rig | None) -> tuple[Rigid, str]:
-    """rover_from_mast if the body cameras stay where they were, and a sentence on it."""
-    rig = done.rig
-    if former is None:
-        raise NoSuchFrame("the folder holds no former mast file, and so no place of its body cameras")
-    names = [
-        name
-        for name, camera in rig.cameras.items()
-        if camera.on == "rover" and name in former.cameras and former.cameras[name].on == "rover"
-    ]
-    if not names:
-        raise NoSuchFrame(
-            "no body camera is tied to the head, and so none shows where the rover frame is. Have the board "
-            "placed where one sees it, or say where the mast is (--mast-at)"
-        )
-    pairs = [(rig.cameras[name].model, former.cameras[name].model) for name in names]
-    motion, rms_px = implied_motion(pairs)
-    sentence = (
-        f"the rover frame is where the former mast file has {' and '.join(names)}, which see "
-        f"{rms_px:.2f} px rms beside that"
-    )
-    return motion.inverse @ rig.mast.rover_from_mast, sentence
 
 
 def without_lonely(survey: Survey) -> tuple[Survey, tuple[str, ...]]:

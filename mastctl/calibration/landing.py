@@ -211,7 +211,7 @@ def rig_differences(new: Rig, former: Rig) -> Iterator[str]:
         old = former.cameras.get(name)
         if old is None or old.on != camera.on or old.model.size_px != camera.model.size_px:
             continue
-        moved, _ = implied_motion([(camera.model, old.model)])
+        moved = implied_motion(camera.model, old.model)
         pixels, far = _seen_grid(old.model, RANGES_M[-1:])
         now, valid = camera.model.project(moved.points(far))
         rms_px = (
@@ -229,25 +229,20 @@ def rig_differences(new: Rig, former: Rig) -> Iterator[str]:
         )
 
 
-def implied_motion(pairs: Sequence[tuple[CameraModel, CameraModel]]) -> tuple[Rigid, float]:
-    """Return the motion of points after which new cameras see them as the former ones saw them before.
+def implied_motion(new: CameraModel, former: CameraModel) -> Rigid:
+    """Return the motion of points after which a camera sees them as its former model saw them before.
 
-    By least squares over all images, with the rms per axis that is left, px. ``pairs`` are new and former
-    models; all of the new ones in one frame, all of the former in another.
+    By least squares over all of its image.
     """
-    new, former = pairs[0]
     turn = new.rotation.T @ former.rotation
     start = Rigid(turn, new.C - turn @ former.C)
-    seen = [(one, *_seen_grid(old, RANGES_M)) for one, old in pairs]
+    pixels, points = _seen_grid(former, RANGES_M)
 
     def off_px(step: FloatArray) -> FloatArray:
-        moved = moved_rigid(start, step)
-        off = [predict(one, moved.points(points)).pixels_px - pixels for one, pixels, points in seen]
-        return np.nan_to_num(np.concatenate(off).ravel(), posinf=0.0, neginf=0.0)
+        off = predict(new, moved_rigid(start, step).points(points)).pixels_px - pixels
+        return np.nan_to_num(off.ravel(), posinf=0.0, neginf=0.0)
 
-    found = least_squares(off_px, np.zeros(6), xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    both = found.fun != 0.0  # where both see
-    return moved_rigid(start, found.x), float(np.sqrt(np.mean(found.fun[both] ** 2))) if both.any() else 0.0
+    return moved_rigid(start, least_squares(off_px, np.zeros(6), xtol=1e-12, ftol=1e-12, gtol=1e-12).x)
 
 
 def _seen_grid(camera: CameraModel, ranges_m: Sequence[float]) -> tuple[FloatArray, FloatArray]:

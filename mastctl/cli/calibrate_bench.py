@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from mastctl.answers import BenchProgress, BenchStep
     from mastctl.bench.result import BenchDone
     from mastctl.bench.run import BenchRun, Reporter
-    from mastctl.bench.survey import RoverFrame
     from mastctl.client import Client
 
 COMMAND = "calibrate bench"
@@ -37,13 +36,6 @@ FRAME = Group(
                 type=finite_number,
             ),
             option("--mast-like MAST.yaml", "the mast's place as in this mast file"),
-            option(
-                "--board-at X Y Z YAW PITCH ROLL",
-                "the first placement's board: its middle (metres), and its turn about the rover's "
-                "z, y, x (degrees; 0 0 0: upright, its face towards the rover)",
-                type=finite_number,
-            ),
-            option("--body-stays", "body cameras stay where the former mast file has them"),
         ),
     ),
     title="where the rover frame is, which pictures cannot show (default: where the mast file in use has it; "
@@ -99,7 +91,7 @@ def survey_folder(out: Path) -> Path:
 def _again(args: argparse.Namespace) -> Answer:
     from calib.survey.reader import read_survey
     from mastctl.bench.result import fit_again
-    from mastctl.bench.survey import RoverFrame, former_rig, frame_of, moved_placements, read_notes
+    from mastctl.bench.survey import former_rig, moved_placements, read_notes, stated_mast
 
     survey = read_survey(args.folder)
     if not survey.boards:
@@ -109,28 +101,24 @@ def _again(args: argparse.Namespace) -> Answer:
             2,
         )
     notes = read_notes(args.folder)
-    frame = _frame(args)
-    if frame == RoverFrame():
-        frame = frame_of(notes)
+    mast_at = _mast_at(args) or stated_mast(notes)
     if args.model is not None:
         survey = survey.as_model(args.model)
     with output.waiting(args.json, f"fitting {len(survey.images)} images"):
         former, moved = former_rig(args.folder), moved_placements(notes)
-        done = fit_again(survey, args.out, args.report, frame, former, moved)
+        done = fit_again(survey, args.out, args.report, mast_at, former, moved)
     models, lines = families_of(args, survey)
     return _answer(done, models, lines)
 
 
-def _frame(args: argparse.Namespace) -> RoverFrame:
-    """What the rover frame hangs on, as far as it was stated."""
+def _mast_at(args: argparse.Namespace) -> list[float] | None:
+    """Where the mast stands, as far as it was stated."""
     from calib.files.mast_file import load_rig
-    from mastctl.bench.survey import RoverFrame
 
-    mast_at = args.mast_at
-    if args.mast_like is not None:
-        mast = load_rig(args.mast_like).rig.mast
-        mast_at = [*mast.translation_m.tolist(), *mast.rotation_rad.tolist()]
-    return RoverFrame(mast_at, args.board_at, args.body_stays)
+    if args.mast_like is None:
+        return args.mast_at  # type: ignore[no-any-return]
+    mast = load_rig(args.mast_like).rig.mast
+    return [*mast.translation_m.tolist(), *mast.rotation_rad.tolist()]
 
 
 def _drive(args: argparse.Namespace) -> Answer:
@@ -241,7 +229,7 @@ def _bench(args: argparse.Namespace, board: Any, folder: Path) -> Iterator[tuple
         reporter = Terminal(args.by_hand or not status["simulated"], args.pictures)
         wanted = BenchGoal(args.wanted_px, args.pictures)
         yield (
-            open_run(client, board, folder, reporter, wanted, args.cameras or served, _frame(args)),
+            open_run(client, board, folder, reporter, wanted, args.cameras or served, _mast_at(args)),
             reporter,
         )
 

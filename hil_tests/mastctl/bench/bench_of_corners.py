@@ -110,16 +110,16 @@ class CornerBench:
         names = [name for name in self.head.rig.cameras if cameras is None or name in cameras]
         self.pictures += len(names)
         seen = [self._seen(name, true_rad) for name in names]
-        return BenchLook(tuple(seen), self._side(self.pan), self._side(self.tilt), seconds)
+        read = self.pan.read_rad, self.tilt.read_rad
+        return BenchLook(tuple(seen), *read, self._side(self.pan), self._side(self.tilt), seconds)
 
     def _side(self, axis: TrueAxis) -> int:
         return 0 if axis.one_sided else axis.side
 
     def _seen(self, camera: str, true_rad: tuple[float, float]) -> SeenBoard:
         mounted = self.true_rig.cameras[camera]
-        read = self.pan.read_rad, self.tilt.read_rad
         if self.rover_from_board is None:
-            return SeenBoard(camera, *read, None, "no corners")
+            return SeenBoard(camera, None, "no corners")
         pose = self.rover_from_board
         if mounted.on == "head":
             pose = rover_from_head(self.true_rig.mast, *true_rad).inverse @ pose
@@ -130,10 +130,10 @@ class CornerBench:
         size = np.array(mounted.model.size_px)
         inside = valid & facing & ((pixels > EDGE_PX) & (pixels < size - 1 - EDGE_PX)).all(axis=1)
         if inside.sum() < 6:
-            return SeenBoard(camera, *read, None, "no corners")
+            return SeenBoard(camera, None, "no corners")
         noisy: FloatArray = pixels[inside] + self.rng.normal(0.0, self.noise_px, (int(inside.sum()), 2))
         corners = Corners(self.board.ids[inside], noisy, np.full(int(inside.sum()), self.noise_px))
-        return SeenBoard(camera, *read, corners)
+        return SeenBoard(camera, corners)
 
 
 @dataclass

@@ -161,7 +161,7 @@ def test_a_search_that_finds_another_board_ends_soon_and_says_why(
     def look(*at: Any) -> BenchLook:
         told = "the board is not in the picture" if bench.looks == 1 else why
         seen = tuple(replace(one, why=told) for one in looked(*at).seen)
-        return BenchLook(seen, 0, 0, 1.0)
+        return BenchLook(seen, *at[:2])
 
     bench.look = look  # type: ignore[assignment, method-assign]
     with pytest.raises(BenchInterrupted, match=re.escape(why)):

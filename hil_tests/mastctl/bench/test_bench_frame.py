@@ -1,4 +1,4 @@
-"""Where the rover frame of a bench is: by a level and a tape, a board at a known place, or body cameras."""
+"""A bench's folder fitted: body cameras that nothing ties, placements that moved, and corners' noise."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from calib.adjust.result import BenchCalibration
 from calib.calibrate.bench import fit_bench
@@ -22,7 +21,7 @@ from calib.survey.writer import write_survey
 from hil_tests.support.sim_survey.bench import NAVCAMS, BenchCamera, BenchPlan, Placement, simulate_bench
 from mastctl.bench import survey as bench_survey
 from mastctl.bench.known import corner_noise
-from mastctl.bench.survey import FORMER, RoverFrame, fit_in_frame
+from mastctl.bench.survey import FORMER, fit_in_frame
 from mastctl.calibration.verdict import judge
 from mastctl.cli.main import main
 
@@ -34,9 +33,6 @@ LOW = (
     Placement(1.5, 0.25, -0.45, (-0.3, 0.4, 0.0)),
     Placement(1.7, -0.25, -0.5, (0.2, -0.4, 0.05)),
 )
-STANDS = Mast(np.array([0.31, -0.02, -1.42]), np.array([0.02, -0.03, 0.05]))
-ELSEWHERE = STANDS.rover_from_mast
-P_IN_ROVER_M = np.array([3.0, 0.4, -1.0])
 
 
 @pytest.fixture(scope="module")
@@ -59,47 +55,6 @@ def fitted(capsys: pytest.CaptureFixture[str], folder: Path, out: Path, *words: 
     return load_rig(out).rig, told
 
 
-def off_px(rig: Rig, true: Rig) -> float:
-    """How far apart two rigs see one point of the rover frame with the left Navcam."""
-    points = P_IN_ROVER_M[None]
-    seen = [one.camera_in_rover("navcam_left", 0.1, -0.05).project(points)[0] for one in (rig, true)]
-    return float(np.abs(seen[0] - seen[1]).max())
-
-
-def moved(true: Rig) -> Rig:
-    """The true rig on a rover whose mast stands as STANDS says."""
-    cameras = {
-        n: replace(c, model=c.model.moved(ELSEWHERE)) if c.on == "rover" else c
-        for n, c in true.cameras.items()
-    }
-    return replace(true, mast=STANDS, cameras=cameras)
-
-
-@pytest.mark.long(2, "a whole driven bench with body cameras")
-def test_board_level_tape_and_body_cameras_give_the_true_rover_frame(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out, true = tmp_path / "m.yaml", moved(TRUE)
-    tape = [*STANDS.translation_m, *STANDS.rotation_rad]
-    rig, _ = fitted(capsys, folder, out, "--mast-at", *tape)
-    assert off_px(rig, true) < 1.0
-    board = ELSEWHERE @ LOW[0].mast_from_board
-    upright = np.column_stack([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
-    turns = Rotation.from_matrix(board.rotation @ upright.T).as_euler("ZYX", degrees=True)
-    rig, told = fitted(capsys, folder, out, "--board-at", *board.translation_m, *turns)
-    assert off_px(rig, true) < 1.0
-    assert "hangs on placement p1" in told["gauges"][0]
-    save_rig(true, folder / FORMER)
-    try:
-        rig, told = fitted(capsys, folder, out, "--body-stays")
-        assert off_px(rig, true) < 2.0  # by one small body camera
-        assert any("where the former mast file has hazcam" in note for note in told["notes"])
-        rig, _ = fitted(capsys, folder, out)  # as its run had it: where the former mast file has the mast
-        assert off_px(rig, true) < 1.0
-    finally:
-        (folder / FORMER).unlink()
-
-
 def test_a_body_camera_that_nothing_ties_is_named_and_stays_where_it_was(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -110,12 +65,15 @@ def test_a_body_camera_that_nothing_ties_is_named_and_stays_where_it_was(
     )
     plan = BenchPlan(cameras={**NAVCAMS, "hazcam": HAZCAM}, placements=far, attitudes=9, checks=2)
     lonely = write_survey(simulate_bench(1, plan), tmp_path / "b").folder
-    save_rig(TRUE, lonely / FORMER)
+    stands = Mast(np.array([0.31, -0.02, -1.42]), np.array([0.02, -0.03, 0.05]))
+    save_rig(replace(TRUE, mast=stands), lonely / FORMER)
     rig, told = fitted(capsys, lonely, tmp_path / "m.yaml")
     assert any(
         "body camera hazcam is not tied to the head: it saw the board at 1 " in n for n in told["notes"]
     )
     np.testing.assert_array_equal(rig.cameras["hazcam"].model.C, TRUE.cameras["hazcam"].model.C)
+    np.testing.assert_allclose(rig.mast.translation_m, stands.translation_m, atol=1e-12)
+    np.testing.assert_allclose(rig.mast.rotation_rad, stands.rotation_rad, atol=1e-12)
 
 
 def test_a_placement_that_moved_is_left_out_with_a_sentence(
@@ -131,8 +89,8 @@ def test_a_placement_that_moved_is_left_out_with_a_sentence(
 
     monkeypatch.setattr(bench_survey, "fit_bench", fits_only_without_p1)
     with pytest.raises(BenchNotFitted, match=r"24\.6 times"):
-        fit_in_frame(survey, RoverFrame(), None)
-    done = fit_in_frame(survey, RoverFrame(), None, moved={"p1": 24.7})
+        fit_in_frame(survey, None, None)
+    done = fit_in_frame(survey, None, None, moved={"p1": 24.7})
     assert {placement for _, placement in done.rover_from_board} == {"p2", "p3"}
     (reason,) = [r for r in judge(survey, done).reasons if "placement p1" in r.sentence]
     assert reason.grade == "care" and "shows the board 24.7 px aside" in reason.sentence

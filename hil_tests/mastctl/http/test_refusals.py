@@ -36,7 +36,7 @@ NO_ANSWER = {
     "survey_refused", "cannot_tell", "address_in_use", "state_in_use",
     "token_refused", "no_executor", "task_failed", "other_program", "bad_rig", "in_the_way",
     "not_there", "look_ended",
-    "report_not_written", "no_such_frame",
+    "report_not_written",
 }  # fmt: skip
 """Of commands that ask no daemon."""
 
