@@ -1,7 +1,7 @@
 """The configuration of one daemon (docs/reference/configuration.md), read strictly.
 
-It is checked in two steps: what the file says by itself here, and what it says about the mast file when that
-is read (`check_cameras`). Options of drivers are handed through as they stand; the drivers judge them.
+The file by itself is checked when it is read; its cameras and pairs are checked when the mast file is read
+(`check_cameras`). Options of drivers are handed through unchanged; the drivers judge them.
 """
 
 from __future__ import annotations
@@ -314,7 +314,7 @@ def not_simulated(settings: HardwareSettings) -> tuple[str, str] | None:
 
 
 def load_head(path: str | Path) -> HardwareSettings:
-    """Read what a configuration says of its head and pass over whatever else it holds. Raises BadFile."""
+    """Read the head of a configuration, whatever else that contains. Raises BadFile."""
     document = parse_mapping(read_bytes(Path(path), _MAX_BYTES), path)
     head = read_record(_HeadAlone, document, path).pan_tilt
     return HardwareSettings(DeviceSettings(head.driver, head.options), {}, folder=Path(path).resolve().parent)
@@ -370,9 +370,9 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def _known(word: str, known: tuple[str, ...]) -> str:
-    """The nearest of what a mast file has, or that it has nothing of the kind."""
-    return nearest(word, known) if known else "it has none"
+def _known(name: str, known: tuple[str, ...]) -> str:
+    """The nearest name in a mast file, or that it has none."""
+    return nearest(name, known) if known else "it has none"
 
 
 def parse_address(text: str) -> Listen:

@@ -1,7 +1,7 @@
 """The record of commands: JSON lines in a bounded file, written by a thread of its own.
 
-No caller is ever held up by the disk. What does not fit into the queue, and what the disk does not take, is
-counted, and the number is recorded where the lines are missing.
+No caller waits for the disk. Lines that do not fit into the queue, or that the disk does not take, are
+counted, and their number is recorded where they are missing.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class AuditLog:
         return () if fault is None else (fault,)
 
     def flush(self, timeout_s: float = 1.0) -> bool:
-        """Wait until what was put before is written or lost; return whether it is, within the time."""
+        """Wait until all lines of before are written or lost; return whether they are, within the time."""
         if self._closed:
             return True
         written = threading.Event()
@@ -83,7 +83,7 @@ class AuditLog:
         return written.wait(timeout_s)
 
     def close(self, timeout_s: float = 1.0) -> None:
-        """Write what waits and end, in ``timeout_s`` seconds at most."""
+        """Write the lines that wait and end, in ``timeout_s`` seconds at most."""
         if not self._closed:
             self._closed = True
             self._queue.put(None)

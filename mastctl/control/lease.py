@@ -98,7 +98,7 @@ class LeaseOver(NotNow):
 
 @dataclass(frozen=True, eq=False)
 class StopCame:
-    """A stop that came; ``how`` says which, and by which client."""
+    """A stop that came: which, and by which client."""
 
     how: str = "the head was stopped"
 

@@ -98,36 +98,20 @@ MEANINGS: Mapping[Word, str] = {
     "starting": "the head has not been read yet",
     "ready": "at rest; nothing runs",
 }
-"""The states: of several that are true the first one in this order counts."""
+"""The states: the daemon's is the first one in this order that is true."""
 
 
 @dataclass(frozen=True)
 class Standing:
     """What the daemon is doing at one moment; replaced at each change, never edited.
 
-    Attributes
-    ----------
-    since_s
-        Since when the state is that, seconds of CLOCK_MONOTONIC.
-    sequence
-        Grows by one with each change of anything in it.
-    operation, target
-        Id of the running operation, None when none runs; the request that runs, or ran last, as it came.
-    head_moves
-        Whether the head's last reading said so; None before the first.
-    coasts
-        Whether it moved when a stop was requested, and was not read at rest since.
-    stops
-        How many stops are under way, which the head has not confirmed.
-    stopping
-        Whether one is, or what it stopped has not ended yet.
-    held
-        What ended the last motion before its goal: a stop, a reset, a fault; empty if nothing did, or an
-        operation or a track has begun since.
-    faults
-        Of the head.
-    latched
-        The causes of the emergency stop that is latched, the oldest first; empty without one.
+    ``since_s``: of the state, seconds of CLOCK_MONOTONIC; ``sequence`` grows by one with each change.
+    ``target``: the request that runs, or ran last. ``head_moves``: of the last reading, None before the
+    first; ``coasts``: it moved when a stop was requested, and was not read at rest since. ``stops``: under
+    way, not confirmed by the head; ``stopping``: one is, or the operation that it stopped has not ended.
+    ``dropped``: what ended the last motion before its goal (a stop, a reset, a fault); empty if nothing did,
+    or an operation or a track has begun since. ``faults`` are the head's; ``latched`` are the causes of an
+    emergency stop, the oldest first.
     """
 
     since_s: float = 0.0
@@ -140,7 +124,7 @@ class Standing:
     coasts: bool = False
     stops: int = 0
     stopping: bool = False
-    held: str = ""
+    dropped: str = ""
     faults: tuple[StandingFault, ...] = ()
     latched: tuple[Latched, ...] = ()
     closing: bool = False
@@ -155,7 +139,7 @@ class Standing:
             "fault": self.faults,
             "tracking": self.track is not None,
             "moving": self.operation is not None or (self.head_moves and not self.coasts),
-            "holding": self.held,
+            "holding": self.dropped,
             "starting": self.head_moves is None,
             "ready": True,
         }
@@ -181,7 +165,7 @@ class Standing:
             case "moving":
                 return "the head moves" if self.operation is None else f"operation {self.operation} runs"
             case "holding":
-                return self.held
+                return self.dropped
             case "starting":
                 return MEANINGS["starting"]
             case _:
@@ -286,7 +270,7 @@ class StateMachine:
 
     def operation_began(self, operation: str, target: Mapping[str, Any]) -> None:
         """Let an operation begin. Raises what `refusal` returns for ``motion``; then nothing has changed."""
-        facts: dict[str, Any] = {"operation": operation, "target": dict(target), "held": ""}
+        facts: dict[str, Any] = {"operation": operation, "target": dict(target), "dropped": ""}
         with self._lock:
             refused = refusal_of(self._standing, "motion")
             if refused is not None:
@@ -308,7 +292,7 @@ class StateMachine:
 
         Nothing is refused: its operation was begun, and a stop in between ends the track too.
         """
-        self._change(lambda now: replace(now, track=track, held=""))
+        self._change(lambda now: replace(now, track=track, dropped=""))
 
     def track_ended(self, track: str) -> None:
         """Note that a track ended."""
@@ -325,10 +309,10 @@ class StateMachine:
         def change(now: Standing) -> Standing:
             if same_faults(now.faults, faults):
                 return now
-            held = now.held
+            dropped = now.dropped
             if not faults and now.operation is None and now.track is None:
-                held = held or f"it is over: {now.faults[0].message}; the next command starts"
-            return replace(now, faults=faults, held=held)
+                dropped = dropped or f"it is over: {now.faults[0].message}; the next command starts"
+            return replace(now, faults=faults, dropped=dropped)
 
         if not same_faults(self._standing.faults, faults):
             self._change(change)
@@ -341,7 +325,7 @@ class StateMachine:
                 stops=now.stops + 1,
                 stopping=now.stopping or not now.latched,
                 coasts=bool(now.head_moves),
-                held=AFTER_A_STOP,
+                dropped=AFTER_A_STOP,
             )
         )
 
@@ -354,15 +338,17 @@ class StateMachine:
 
         From then on nothing may begin. ``latched`` returns all causes of then; it must not wait.
         """
-        self._change(lambda now: replace(now, latched=tuple(latched()), held=AFTER_A_STOP))
+        self._change(lambda now: replace(now, latched=tuple(latched()), dropped=AFTER_A_STOP))
 
     def reset(self, name: str, reason: str, latched: Callable[[], Sequence[Latched]] = tuple) -> None:
         """Note that a latch was released, of a service that called `refusal` of ``latch`` before.
 
         ``latched`` returns the causes that came since. It must not wait.
         """
-        held = f"reset by {name}: {reason}; the next command starts"
-        self._change(lambda now: replace(now, latched=tuple(latched()), held=held) if now.latched else now)
+        dropped = f"reset by {name}: {reason}; the next command starts"
+        self._change(
+            lambda now: replace(now, latched=tuple(latched()), dropped=dropped) if now.latched else now
+        )
 
     def closing(self) -> None:
         """Note that the service is closing: nothing begins any more."""

@@ -3,9 +3,9 @@
 It is kept in the head's folder (`mastctl.safety.state_folder`), or in the state folder for a head in this
 program's memory. It keeps a log of its causes, and a reset releases all of them.
 
-A file that cannot be read means latched: so a stop is written over the file of a released latch, which is
-there from the start, and quick. The disk never holds the stop up: a thread of its own writes, after the head
-was stopped, and tries again for as long as the disk refuses.
+A file that cannot be read means latched: so a stop is written over the file of a released latch, which exists
+from the start, and quick. The stop never waits for the disk: a thread of its own writes, after the head was
+stopped, and tries again for as long as the disk refuses.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Which mast file is in use, as it was read, and which was before: changed only while the head rests."""
+"""The mast file in use, as it was read, and the one before it: changed only while the head rests."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from calib.errors import BadFile, CalibError
 from calib.files import is_plain_file, read_bytes
 from calib.files.mast_file import StoredRig, parse_rig
-from calib.files.yaml_text import MAX_BYTES
+from calib.files.yaml_text import MAX_BYTES, parse_mapping
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.mode import SensorMode
 from calib.geometry.rig import Rig
 from drivers.errors import BadFrame
-from mastctl.answers import MastTold
-from mastctl.config import Config, check_cameras
+from mastctl.answers import ConfigChange, MastTold
+from mastctl.config import Config, check_cameras, parse_config
 from mastctl.control.machine import StateMachine
 from mastctl.control.operations import OperationRunner
 from mastctl.devices.devices import Devices
@@ -31,10 +32,22 @@ log = logging.getLogger(__name__)
 
 
 class BadMastFile(BadRequest):
-    """A mast file that cannot take the place of the one in use; the sentence says why."""
+    """A mast file that cannot take the place of the one in use."""
 
     def __init__(self, message: str) -> None:
         super().__init__("bad_mast_file", message)
+
+
+FIXED: Mapping[str, tuple[Callable[[Config], object], str]] = {
+    "listen": (lambda config: config.listen, "the address is taken at the start"),
+    "pan_tilt": (lambda config: config.hardware.pan_tilt, "the head is opened at the start"),
+    "cameras": (lambda config: config.hardware.cameras, "cameras are opened at the start"),
+    "simulation": (lambda config: config.hardware.simulation, "the simulated rover is made at the start"),
+    "state": (lambda config: config.state_folder, "the state folder is locked at the start"),
+    "record.folder": (lambda config: config.record.folder, "recordings are opened there"),
+    "tracking.handoff_log": (lambda config: config.tracking.handoff_log, "it is read at the start"),
+}
+"""Keys that a running daemon cannot change: the value in a configuration, and why it cannot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,13 +72,11 @@ def read_mast(path: Path, config: Config) -> MastInUse:
 
 
 def read_next(name: str, config: Config, now: MastInUse, sensor_modes: Mapping[str, SensorMode]) -> MastInUse:
-    """Read the mast file that shall take the place of the one in use.
+    """Read the mast file that shall take the place of the one in use, ``now``.
 
-    ``name``: of a file in the folder of the configured mast file, without any folder; ``now``: the one in
-    use: configured cameras must be mounted alike and take images of the same size; ``sensor_modes``: those of
-    cameras that know it, which have to be the file's.
-
-    Raises BadMastFile if it may not, cannot be read, or does not fit.
+    ``name`` is that of a file in the folder of the configured one. Its configured cameras must be mounted
+    alike, have the same image sizes, and the ``sensor_modes`` of cameras that know theirs. Raises
+    BadMastFile.
     """
     folder = config.mast_file.parent
     if Path(name).name != name or name.startswith(".") or "\\" in name or "\0" in name:
@@ -90,6 +101,51 @@ def read_next(name: str, config: Config, now: MastInUse, sensor_modes: Mapping[s
     return found
 
 
+def named_next(
+    before: Config, after: Config, now: MastInUse, sensor_modes: Mapping[str, SensorMode]
+) -> MastInUse | None:
+    """Return the mast file that comes into use with a configuration; None if the one in use stays.
+
+    One that a command has put into use stays as long as the configuration names the same as before. Raises
+    BadMastFile.
+    """
+    if after.mast_file == before.mast_file and now.path != after.mast_file:
+        return None
+    named = read_next(after.mast_file.name, after, now, sensor_modes)
+    return None if named.stored.digest == now.stored.digest else named
+
+
+def check_fixed(before: Config, after: Config) -> None:
+    """Pass a configuration with the former one's keys of `FIXED`. Raises NotNow ``restart_needed``."""
+    was = parse_config(before.data, before.path) if before.data else before
+    refused = [f"{key} ({why})" for key, (of, why) in FIXED.items() if of(was) != of(after)]
+    if refused:
+        message = (
+            f"{before.path} has another {', '.join(refused)}; nothing was changed: restart the daemon for it"
+        )
+        raise NotNow("restart_needed", message)
+
+
+def changes_of(before: Config, after: Config) -> Iterator[ConfigChange]:
+    """Yield the differences of two configurations' files, key by key."""
+    old, new = (_flat(config) for config in (before, after))
+    for key in sorted({*old, *new}):
+        if old.get(key) != new.get(key):
+            yield {"key": key, "before": old.get(key), "after": new.get(key)}
+
+
+def _flat(config: Config) -> dict[str, Any]:
+    """A file's keys and those one below, ``limits.pan_rad``."""
+    document = parse_mapping(config.data, config.path) if config.data else {}
+    flat: dict[str, Any] = {}
+    for key, value in document.items():
+        if isinstance(value, dict):
+            flat |= {f"{key}.{name}": inner for name, inner in value.items()}
+        else:
+            flat[key] = value
+    return flat
+
+
 def _check_modes(mast: MastInUse, sensor_modes: Mapping[str, SensorMode]) -> None:
     """Pass a mast file that has the modes of the cameras that know theirs. Raises BadMastFile."""
     for camera, mode in sensor_modes.items():
@@ -102,7 +158,7 @@ def _check_modes(mast: MastInUse, sensor_modes: Mapping[str, SensorMode]) -> Non
 
 
 def configured(rig: Rig, cameras: Iterable[str]) -> Rig:
-    """Return the part of a rig that is configured: nothing is aimed with a camera that is not there."""
+    """Return the part of a rig that is configured: nothing is aimed with an absent camera."""
     names = set(cameras)
     fit = {key: value for key, value in rig.fit.items() if key not in ("parameters", "covariance")}
     try:

@@ -10,22 +10,32 @@ import logging
 import math
 import random
 import threading
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, replace
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
+from calib.errors import BadFile
 from calib.files.mast_file import StoredRig
 from calib.matching.handoff import MatchedHandoff
 from drivers.clock import Clock, SystemClock
+from drivers.errors import BadOptions
 from drivers.hardware import Hardware, clock_for, head_name
 from drivers.simulation_clock import SimulationClock
-from mastctl.answers import CalibrationTold, CameraTold, KeptTarget, MeasuredJoints, Status, TrackTold
+from mastctl.answers import (
+    CalibrationTold,
+    CameraTold,
+    KeptTarget,
+    MeasuredJoints,
+    ReloadResult,
+    Status,
+    TrackTold,
+)
 from mastctl.as_json import as_json
 from mastctl.bench.operation import BenchOperation
-from mastctl.config import Config
+from mastctl.config import Config, check_cameras, load_config
 from mastctl.control.audit import STRANGERS, STRANGERS_FILES, AuditLog
 from mastctl.control.entry import Answers, CommandEntry
 from mastctl.control.lease import LeaseTable, Steerer
@@ -35,8 +45,9 @@ from mastctl.control.publisher import Topic
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import OPERATIONS, StampedFrame, check_known, random_run
 from mastctl.devices.joint_history import HeadReading
+from mastctl.devices.judge import OutsideLimits
 from mastctl.devices.opening import open_rig
-from mastctl.errors import MastctlError
+from mastctl.errors import BadRequest, MastctlError
 from mastctl.motion.jog import Jogs
 from mastctl.motion.requests import wrong_camera
 from mastctl.motion.search import in_picture
@@ -49,7 +60,15 @@ from mastctl.safety import stop_socket
 from mastctl.safety.latch import Latch
 from mastctl.safety.state_folder import StateFolder, other_head_folders
 from mastctl.safety.stop_socket import StopSocket
-from mastctl.service.masts import MastInUse, Masts, configured, read_mast
+from mastctl.service.masts import (
+    MastInUse,
+    Masts,
+    changes_of,
+    check_fixed,
+    configured,
+    named_next,
+    read_mast,
+)
 from mastctl.service.places import places, targets
 from mastctl.service.steering import Steering
 from mastctl.service.stopping import SocketStops, Stopping, StopThreads, state_faults
@@ -287,7 +306,7 @@ class Service:
         return mast_verdict(self.health.verdict, looks, handoffs, slip)
 
     def track_answer(self, status: TrackStatus | None = None) -> TrackTold:
-        """Return the track, as it is or was, and the self-check of now as ``GET /track`` tells them."""
+        """Return the track, as it is or was, and the self-check of now, as ``GET /track`` has them."""
         track = (status or self.tracker.status).as_json(self.clock.now_s())
         return {**track, "self_check": self.handoffs.summary()}
 
@@ -412,7 +431,50 @@ class Service:
             *state_faults(self.folder, self.latch, self.started_s),
         )
 
-    def use_config(self, config: Config) -> None:
+    def reload(self) -> ReloadResult:
+        """Read the configuration's file again and use it; return the changes, the mast file, and notes.
+
+        All of it comes into use while the head rests, or nothing where it raises: BadRequest ``bad_config``,
+        ``bad_mast_file``; NotNow ``restart_needed`` if a key of `FIXED` differs; ``busy``, ``moving``;
+        DriverError if the head does not answer.
+        """
+        self.manager.reloading()
+        before = self.config
+        try:
+            after = load_config(before.path)
+            check_fixed(before, after)
+            mast = named_next(before, after, self.masts.in_use, self.devices.sensor_modes)
+            check_cameras(after, (mast or self.masts.in_use).stored.rig)
+            after = replace(after, listen=before.listen)  # as the command line may have it
+            with self.masts.resting() as use:
+                self._use_config(after)
+                if mast is not None:
+                    use(mast)
+        except (
+            BadFile,
+            BadOptions,
+        ) as error:  # the judge has not taken the limits, and nothing else had its turn
+            raise BadRequest("bad_config", " ".join(str(error).split())) from None
+        finally:
+            self.manager.ready()
+        changed = list(changes_of(before, after))
+        log.info(
+            "the configuration was read again: %s", ", ".join(one["key"] for one in changed) or "no change"
+        )
+        return {"changed": changed, "mast": self.masts.in_use.as_json(), "notes": list(self._notes())}
+
+    def _notes(self) -> Iterator[str]:
+        """Sentences about the head and new limits."""
+        reading = self.devices.last_reading
+        if reading is not None:
+            try:
+                self.config.limits.check(reading.pan_rad, reading.tilt_rad)
+            except OutsideLimits as error:
+                yield f"the head is where it may not be sent any more: {error}; it may be sent back inside"
+        for fault in self.devices.judge.faults(reading):
+            yield fault.message
+
+    def _use_config(self, config: Config) -> None:
         """Use another configuration of the same devices while nothing runs; the limits first.
 
         Raises BadOptions if the head does not keep its limits; nothing has changed.

@@ -1,6 +1,6 @@
 """The stop, the emergency stop, and the reset: the head first, everything else after it.
 
-Nothing comes before the head: no log, no file, and no lock that is held for longer than a read.
+Nothing comes before the head: no log, no file, and no lock that is kept for longer than a read.
 """
 
 from __future__ import annotations
@@ -232,7 +232,7 @@ def state_faults(folder: StateFolder, latch: Latch, started_s: float) -> Iterato
         message = f"an emergency stop would not survive a restart: {folder.refused}"
         yield StandingFault(STATE, "state_not_kept", message, started_s, "the daemon is started again")
     elif latch.not_kept and not latch.folder.is_temporary:
-        message = f"the emergency stop is held in memory only: {latch.not_kept}"
+        message = f"the emergency stop is kept in memory only: {latch.not_kept}"
         yield StandingFault(STATE, "latch_not_kept", message, latch.since_s, "the disk takes it, or a reset")
 
 

@@ -38,7 +38,6 @@ from mastctl.control.entry import (
 )
 from mastctl.http import PREFIX
 from mastctl.service.masts import MastInUse, Masts
-from mastctl.service.reload import reload
 from mastctl.web.commands import Asks, command
 from mastctl.web.described import file_of
 from mastctl.web.models import BenchBody, MastBody, PlaceBody, RecordBody
@@ -99,7 +98,7 @@ def add_masts(app: FastAPI) -> None:
         app, "POST /reload", RELOAD, "Read the configuration again: all of it comes into use, or nothing"
     )
     def read_again(here: Here) -> ReloadResult:
-        return reload(here.service)
+        return here.service.reload()
 
 
 def _mast_change(masts: Masts, mast: MastInUse) -> MastChange:

@@ -13,7 +13,7 @@ from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.judge import OutsideLimits
 from mastctl.errors import Stopped
-from mastctl.service.reload import FIXED
+from mastctl.service.masts import FIXED
 
 Pair = tuple[RunningDaemon, FakeHardware]
 
@@ -61,7 +61,7 @@ def test_a_head_outside_new_limits_may_only_go_back_in(pair: Pair, client: Clien
     here = present(client.status()["joints"])["pan_rad"]
     write(pair, "pan_rad: [-2.0, 2.0]", f"pan_rad: [{here + 0.3}, 2.0]")
     (note,) = client.reload()["notes"]
-    assert "stands where it may not be sent any more" in note
+    assert "is where it may not be sent any more" in note
     devices = pair[0].service.devices
     with pytest.raises(OutsideLimits):
         devices.move(here + 0.1, 0.0)  # nearer, but still outside
