@@ -139,10 +139,6 @@ class Panoramas:
                 continue
         return {"panoramas": found}
 
-    def about(self, name: str) -> dict[str, Any]:
-        """Return the index of one as JSON. Raises NotKnown, Unable."""
-        return self.open(name).index.model_dump(mode="json", by_alias=True, exclude_none=True)
-
     def slip(self, mast_digest: str) -> str:
         """Return what the newest panorama's seams say against a mast file; '' for nothing. Reads no disk."""
         newest = self._newest

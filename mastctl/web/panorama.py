@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import FastAPI, Path, Request
 from fastapi.responses import FileResponse, Response
@@ -10,6 +10,7 @@ from fastapi.responses import FileResponse, Response
 from mastctl.answers import PanoramaList, Started, TargetList
 from mastctl.control.entry import PANORAMA, TARGET_FORGET, TARGET_KEEP
 from mastctl.http import PREFIX
+from mastctl.panorama.folder import Index
 from mastctl.service.steering import usual_s
 from mastctl.web.commands import command
 from mastctl.web.described import file_of
@@ -40,9 +41,13 @@ def add_panoramas(app: FastAPI) -> None:
     async def listed(here: Here) -> PanoramaList:
         return await here.waiting.run(here.service.panoramas.listed)
 
-    @app.get(f"{PREFIX}/panoramas/{{name}}", summary="A panorama's index: its views, its mosaic, its seams")
-    async def about(name: Panorama, here: Here) -> dict[str, Any]:
-        return await here.waiting.run(lambda: here.service.panoramas.about(name))
+    @app.get(
+        f"{PREFIX}/panoramas/{{name}}",
+        summary="A panorama's index: its views, its mosaic, its seams",
+        response_model_exclude_none=True,
+    )
+    async def about(name: Panorama, here: Here) -> Index:
+        return await here.waiting.run(lambda: here.service.panoramas.open(name).index)
 
     @app.get(
         f"{PREFIX}/panoramas/{{name}}/picture",
