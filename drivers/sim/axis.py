@@ -12,8 +12,8 @@ which it is ahead of the motor obeys
     x'' + 2 ζ ω x' + ω² x = -g a(t)
 
 with the motor's acceleration a. A profile's acceleration is constant in pieces, so x is a sum of answers to
-steps (and, where an axis seizes, to a jump in velocity), each in closed form. Neither the encoder nor the
-play of the gears notices.
+steps, each in closed form. Neither the encoder nor the play of the gears notices; that a fault seizes an axis
+rings nothing.
 """
 
 from __future__ import annotations
@@ -340,15 +340,14 @@ class WireAxis:
         decay = s.ring_damping * omega
         damped = omega * math.sqrt(1 - s.ring_damping**2)
         left, acceleration = 0.0, 0.0
-        for shock_s, shock_rad_per_s2, jump_rad_per_s in motion.shocks(time_s):
-            step, acceleration = shock_rad_per_s2 - acceleration, shock_rad_per_s2
-            by_step, by_jump = step / omega**2, jump_rad_per_s / damped
+        for shock_s, shock_rad_per_s2 in motion.shocks(time_s):
+            by_step = (shock_rad_per_s2 - acceleration) / omega**2
+            acceleration = shock_rad_per_s2
             envelope = math.exp(-decay * (time_s - shock_s))
-            if s.ring_gain * (2 * abs(by_step) + abs(by_jump)) * envelope < STILL_RAD:
+            if s.ring_gain * 2 * abs(by_step) * envelope < STILL_RAD:
                 continue
             phase = damped * (time_s - shock_s)
-            swing = by_step * (math.cos(phase) + decay / damped * math.sin(phase))
-            left += envelope * (swing - by_jump * math.sin(phase))
+            left += envelope * (by_step * (math.cos(phase) + decay / damped * math.sin(phase)))
         return s.ring_gain * (left - acceleration / omega**2)
 
     def _continue(self, motion: Motion, time_s: float) -> None:

@@ -128,27 +128,15 @@ class Motion:
         """Return position (rad) and velocity (rad/s) at a moment."""
         return self.legs[self.leg_index(time_s)].at(time_s)
 
-    def shocks(self, until_s: float) -> Iterator[tuple[float, float, float]]:
-        """Yield what shook the axis until a moment, oldest first.
-
-        From a moment (s) on it accelerates so much (rad/s²); there its velocity jumps (rad/s), if a fault
-        seizes it.
-        """
-        speed = self.legs[0].start_rad_per_s
+    def shocks(self, until_s: float) -> Iterator[tuple[float, float]]:
+        """Yield from which moments (s) on it accelerates how much (rad/s²), until a moment, oldest first."""
         for number, leg in enumerate(self.legs):
             after = self.legs[number + 1 :]
             end_s = after[0].start_s if after else math.inf
-            if leg.start_s > until_s:
-                return
-            if end_s <= leg.start_s:
-                continue  # replaced in the moment that it began
-            jump = leg.start_rad_per_s - speed
             for time_s, acceleration in leg.accelerations():
                 if time_s >= end_s or time_s > until_s:
                     break
-                yield time_s, acceleration, jump
-                jump = 0.0
-            speed = leg.at(end_s)[1]
+                yield time_s, acceleration
 
     @property
     def end_s(self) -> float:
@@ -197,5 +185,5 @@ class Motion:
         return self._then(time_s, [leg])
 
     def jammed(self, time_s: float) -> Motion:
-        """Return the motion seized at ``time_s``: at rest at once (the one jump in velocity; a fault)."""
+        """Return the motion seized at ``time_s``: at rest at once, the one jump in velocity; a fault."""
         return self._then(time_s, Motion.at_rest(time_s, self.at(time_s)[0]).legs)
