@@ -204,7 +204,7 @@ class ScriptedLoop:
         self._devices = devices
         *_, self._record, self._cancelled = others
 
-    def run(self, request: Any) -> Any:
+    def run(self, request: Any, view_rad: Any = None) -> Any:
         return type(self).script(request, self._record, self._cancelled, self._devices)
 
     @staticmethod

@@ -1,4 +1,4 @@
-"""Cameras of this machine, without a daemon: camera list, check, focus and sync."""
+"""Cameras of this machine, without a daemon: camera list, check, grab, focus and sync."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from mastctl import signals
@@ -53,32 +54,59 @@ def camera_list(args: argparse.Namespace) -> Answer:
     "camera check",
     *CAMERA,
     option("--seconds S", "how long", default=5.0),
-    option("--out FILE.png", "write the last picture"),
     help="check a camera's properties and what it really delivers; 1 if no frame came",
     example="/dev/video0 --rate 30",
 )
 def camera_check(args: argparse.Namespace) -> Answer:
     """Compare some seconds of a camera's frames with what a driver promises, and show what it can do."""
     from drivers.clock import SystemClock
-    from mastctl.report.pictures import encoded
     from mastctl.setup.camera_check import CameraCheck
 
-    if args.out is not None:
-        check_file(args.out, "--out")
     with opened_camera(args) as (camera, size_px):
-        check = CameraCheck(args.camera, camera, SystemClock(), size_px)
-        found = check.run(args.seconds)
+        found = CameraCheck(args.camera, camera, SystemClock(), size_px).run(args.seconds)
         found |= getattr(camera, "abilities", dict)()  # and what else a driver knows of its camera
         if (identity := getattr(camera, "identity", None)) is not None:
             found |= {name: getattr(identity, name) for name in ("driver", "card", "bus")}
         if (counters := getattr(camera, "counters", None)) is not None:
             found |= {name: getattr(counters, name) for name in ("dropped", "damaged", "late")}
         found["problems"] += [problem.message for problem in getattr(camera, "problems", ())]
-    if args.out is not None and check.image is not None:
-        args.out.write_bytes(encoded(check.image, "png"))
     shown = {key: value for key, value in found.items() if key != "problems"}
     problems = [f"problem: {one}" for one in found["problems"]] or ["no problem was found"]
     return Answer(found, [*tables_of(shown, f"check of {args.camera}"), *problems], int(not found["frames"]))
+
+
+@command(
+    "camera grab",
+    *CAMERA,
+    option("--out FILE.png", "image to write", required=True),
+    option("--aim X Y", "mark this pixel"),
+    help="one fresh picture as PNG, with its time in it",
+    example="/dev/video0 --out picture.png",
+)
+def camera_grab(args: argparse.Namespace) -> Answer:
+    """Write one fresh picture; a cross marks --aim and leaves the pixel itself free."""
+    import cv2
+
+    from mastctl.report.pictures import encoded, in_colour, with_text
+
+    check_file(args.out, "--out")
+    with opened_camera(args) as (camera, _):
+        frame = camera.next_frame(time.monotonic(), FRAME_TIMEOUT_S)
+    taken_s = time.time() - (time.monotonic() - frame.mid_exposure_s)
+    facts = {
+        "camera": args.camera,
+        "time_utc": datetime.fromtimestamp(taken_s, UTC).isoformat(timespec="milliseconds"),
+        "mid_exposure_s": repr(frame.mid_exposure_s),
+        "exposure_s": repr(frame.exposure_s),
+    }
+    image = frame.image
+    if args.aim is not None:
+        image = in_colour(image)
+        x, y = map(round, args.aim)
+        for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            cv2.line(image, (x + 4 * dx, y + 4 * dy), (x + 16 * dx, y + 16 * dy), (0, 255, 255), 1)
+    args.out.write_bytes(with_text(encoded(image, "png"), facts))
+    return Answer({"out": str(args.out), "size_px": [image.shape[1], image.shape[0]], **facts})
 
 
 @command(

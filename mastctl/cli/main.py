@@ -248,10 +248,13 @@ def _run(words: Sequence[str]) -> int:
 
 
 def _joined(words: Sequence[str]) -> tuple[list[str], str]:
-    """Return the words with a command of two words as one, and the command.
+    """Return the words with a leading --url last and a command of two words as one, and the command.
 
     Raises WrongUse for an unknown command, with the nearest known one; argparse would list them all.
     """
+    if words and words[0].split("=")[0] == "--url":
+        size = 2 if words[0] == "--url" else 1
+        words = [*words[size:], *words[:size]]
     if not words or words[0].startswith("-"):
         return list(words), ""
     command, *rest = words

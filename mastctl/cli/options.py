@@ -155,7 +155,7 @@ def option(usage: str, help: str, *, repeat: bool = False, **settings: Any) -> O
     if "|" in values[0]:
         found["choices"] = values[0].split("|")
     else:
-        found["metavar"] = tuple(values) if len(values) > 1 else values[0]
+        found["metavar"] = tuple(values) if len(values) > 1 and "nargs" not in settings else " ".join(values)
         found["type"] = _reader(values)
     if repeat:
         found |= {"action": "append", "default": []}

@@ -8,8 +8,9 @@ import re
 import sys
 from typing import TYPE_CHECKING, Any
 
+from mastctl import signals
 from mastctl.cli import output
-from mastctl.cli.options import at_least, command, option
+from mastctl.cli.options import at_least, command, finite_number, option
 from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, check_folder
 
 if TYPE_CHECKING:
@@ -18,6 +19,14 @@ if TYPE_CHECKING:
 
 HEADS = "ptu_d46_70|dynamixel_x|ph42"
 MARKS = {"good": "✓", "unsure": "?", "bad": "✗"}
+QUESTIONS: tuple[tuple[Any, ...], ...] = (
+    ("height", "height of the axes over the ground, m", 1.0),
+    ("baseline", "distance of the two cameras, m", 0.1),
+    ("view_deg", "the cameras' view across, degrees", 60.0),
+    ("pan_deg", "how far pan may turn, degrees", -85.0, 85.0),
+    ("tilt_deg", "how far tilt may turn, degrees", -40.0, 30.0),
+)
+"""Options of ``rig new``, how a person is asked for them, and what is usual."""
 TWIN = "no head and no camera is plugged in: this is the simulated twin, which runs"
 
 
@@ -39,11 +48,11 @@ def _port(text: str) -> str:
     ),
     option("--pan-id ID", "the servo that turns pan", type=at_least(0)),
     option("--tilt-id ID", "the servo that turns tilt", type=at_least(0)),
-    option("--pan-deg LOW HIGH", "how far pan may turn, degrees", default=[-85.0, 85.0]),
-    option("--tilt-deg LOW HIGH", "how far tilt may turn, degrees", default=[-40.0, 30.0]),
-    option("--height M", "of the axes over the ground", default=1.0),
-    option("--baseline M", "between the two cameras", default=0.1),
-    option("--view-deg DEG", "the cameras' view across", default=60.0),
+    option("--pan-deg LOW HIGH", "how far pan may turn, degrees (default -85 85)"),
+    option("--tilt-deg LOW HIGH", "how far tilt may turn, degrees (default -40 30)"),
+    option("--height M", "of the axes over the ground (default 1)"),
+    option("--baseline M", "between the two cameras (default 0.1)"),
+    option("--view-deg DEG", "the cameras' view across (default 60)"),
     help="query serial lines and cameras; write configuration, drawing, udev rules and next "
     "commands. Moves nothing, replaces nothing; without hardware it writes a simulated twin",
     example="rig --pan-deg -90 90 --tilt-deg -40 30",
@@ -67,10 +76,10 @@ def _new(args: argparse.Namespace) -> Answer:
     if args.port and head is None:
         raise CommandError("no_head", f"no head: {'; '.join(found.unused)}; nothing is written")
     pan_id, tilt_id = _axes(args, head)
+    (height_m,), (baseline_m,), (view_deg,), pan_deg, tilt_deg = _numbers(args)
     numbers = RigNumbers(
-        args.height, args.baseline, args.view_deg, pan_deg=tuple(args.pan_deg), tilt_deg=tuple(args.tilt_deg),
-        pan_id=pan_id, tilt_id=tilt_id,
-    )  # fmt: skip
+        height_m, baseline_m, view_deg, pan_deg=pan_deg, tilt_deg=tilt_deg, pan_id=pan_id, tilt_id=tilt_id
+    )
     simulated = head is None and not found.cameras
     if simulated:
         output.tell(TWIN)
@@ -90,6 +99,24 @@ def _new(args: argparse.Namespace) -> Answer:
     }
     written = f"written in {args.folder}: {', '.join(made.files)}"
     return Answer(document, [written, "next:", *(f"  {one}" for one in made.next)])
+
+
+def _numbers(args: argparse.Namespace) -> list[Any]:
+    """The numbers of the options; a person at a terminal is asked for the others, with the usual ones."""
+    asks, found = not args.json and signals.can_ask(), []
+    for name, question, *usual in QUESTIONS:
+        given = getattr(args, name)
+        numbers = tuple(given) if isinstance(given, list) else () if given is None else (given,)
+        while asks and not numbers:
+            sys.stderr.write(f"{question} [{' '.join(f'{one:g}' for one in usual)}]: ")
+            sys.stderr.flush()
+            try:
+                texts = sys.stdin.readline().split() or list(map(str, usual))
+                numbers = tuple(map(finite_number, texts)) if len(texts) == len(usual) else ()
+            except argparse.ArgumentTypeError as error:
+                output.tell(str(error))
+        found.append(numbers or tuple(usual))
+    return found
 
 
 def _axes(args: argparse.Namespace, head: ProbedHead | None) -> tuple[int, int]:

@@ -199,8 +199,13 @@ def _snapshot(args: argparse.Namespace) -> Answer:
     if kind is None:
         raise WrongUse(f"--out is '{args.out}' where a name ending in {', '.join(SUFFIXES)} is expected")
     output.check_file(out, "--out")
+    from mastctl.report.pictures import with_text
+
     with client_of(args) as client:
         shot = client.snapshot(args.camera, frame_id=args.frame_id, format="png" if kind == "png" else "jpeg")
-    out.write_bytes(shot.data)
+    data = shot.data
+    if kind == "png":
+        data = with_text(data, {name: str(value) for name, value in shot.facts.items()})
+    out.write_bytes(data)
     facts = chosen(shot.facts, "frame_id pan_rad tilt_rad moving")
     return Answer({"file": str(out), **shot.facts}, f"{out}: {cell(facts)}")

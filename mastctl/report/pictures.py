@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import base64
+import struct
+import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -73,3 +76,17 @@ def enlarged(image: Image, center_px: tuple[float, float], half_px: int, scale: 
     side = 2 * half_px * scale + 1
     piece = cv2.warpAffine(in_colour(image), matrix, (side, side), flags=cv2.INTER_LINEAR)
     return np.asarray(piece, dtype=np.uint8)
+
+
+def with_text(png: bytes, texts: Mapping[str, str]) -> bytes:
+    """Return a PNG file with texts by keyword (1 to 79 Latin letters): iTXt chunks after the header.
+
+    Source: PNG specification, chapters 5 (chunks) and 11.3.3 (text); the header IHDR ends at byte 33.
+    """
+
+    def chunk(data: bytes) -> bytes:
+        checked = b"iTXt" + data
+        return struct.pack(">I", len(data)) + checked + struct.pack(">I", zlib.crc32(checked))
+
+    chunks = (chunk(key.encode("latin-1") + b"\0\0\0\0\0" + text.encode()) for key, text in texts.items())
+    return png[:33] + b"".join(chunks) + png[33:]

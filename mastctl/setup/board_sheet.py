@@ -6,6 +6,7 @@ import math
 import zlib
 from dataclasses import dataclass
 from itertools import pairwise
+from xml.sax.saxutils import escape
 
 from calib.targets.boards import AnyBoard, AprilGrid, Charuco, Checkerboard, DotBoard
 from calib.targets.pattern import Spots, pattern_of
@@ -196,6 +197,28 @@ DOT_POINTS = 8
 """Curves an ellipse is made of: the middle of such a dot is exact by symmetry."""
 
 
+def svg_of(sheet: Sheet) -> bytes:
+    """Return the sheet as SVG; one unit is a millimetre."""
+    width, height = sheet.size_mm
+    boxes = "".join(f"M{_n(a)} {_n(b)}H{_n(c)}V{_n(d)}H{_n(a)}Z" for a, b, c, d in sheet.rectangles)
+    spots = "\n".join(
+        f'<ellipse cx="{_n(x)}" cy="{_n(y)}" rx="{_n(rx)}" ry="{_n(ry)}"/>' for x, y, rx, ry in sheet.ellipses
+    )
+    lines = "\n".join(_svg_text(one) for one in sheet.lines)
+    paper = f'width="{_n(width)}mm" height="{_n(height)}mm" viewBox="0 0 {_n(width)} {_n(height)}"'
+    text = f"""<?xml version="1.0" encoding="UTF-8"?>
+<svg xmlns="http://www.w3.org/2000/svg" {paper}>
+<rect width="{_n(width)}" height="{_n(height)}" fill="white"/>
+<path d="{boxes}"/>
+{spots}
+<g font-family="Helvetica, Arial, sans-serif">
+{lines}
+</g>
+</svg>
+"""
+    return text.encode()
+
+
 def pdf_of(sheet: Sheet) -> bytes:
     """Return the sheet as PDF 1.4, one page, that asks viewers not to scale it."""
     width, height = (size * PT_PER_MM for size in sheet.size_mm)
@@ -244,6 +267,12 @@ def _pdf_text(line: TextLine) -> str:
     text = line.text.replace("\\", "\\\\").replace("(", "\\(").replace(")", "\\)")
     turn = "0 -1 -1 0" if line.upwards else "1 0 0 -1"
     return f"BT /F1 {_n(line.height_mm)} Tf {turn} {_n(line.x_mm)} {_n(line.y_mm)} Tm ({text}) Tj ET"
+
+
+def _svg_text(line: TextLine) -> str:
+    x, y = _n(line.x_mm), _n(line.y_mm)
+    turn = f' transform="rotate(-90 {x} {y})"' if line.upwards else ""
+    return f'<text x="{x}" y="{y}" font-size="{_n(line.height_mm)}"{turn}>{escape(line.text)}</text>'
 
 
 def _n(value: float) -> str:

@@ -184,13 +184,15 @@ STATED = ("size_px", "sensor_mode", "period_s")
 DARK, SATURATED = 5, 250
 
 
-def quality_of(image: Image) -> dict[str, float]:
+def quality_of(image: Image) -> dict[str, Any]:
     """Return exposure and sharpness of an image, uint8 (h, w) or (h, w, 3) BGR.
 
-    ``dark_share`` and ``saturated_share`` are those of the pixels at or below 5, and at or above 250.
+    ``histogram`` has the shares of the pixels in 16 equal ranges of grey level, 0 to 255; ``dark_share`` and
+    ``saturated_share`` are those at or below 5, and at or above 250.
     """
     grey = _grey(image)
     return {
+        "histogram": (np.histogram(grey, bins=16, range=(0, 256))[0] / grey.size).tolist(),
         "mean": float(grey.mean()),
         "dark_share": float((grey <= DARK).mean()),
         "saturated_share": float((grey >= SATURATED).mean()),

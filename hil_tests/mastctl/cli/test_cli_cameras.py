@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+import io
+
 import cv2
 import numpy as np
 import pytest
+from PIL import Image as PillowImage
 
 from mastctl.cli.main import main
+from mastctl.report.pictures import with_text
 from mastctl.setup.camera_check import quality_of, sharpness
 
 PICTURE = np.random.default_rng(2).integers(0, 256, (48, 64), dtype=np.uint8)
+TEXTS = {"time_utc": "2026-01-02T03:04:05.678+00:00", "pan_rad": "0.1", "name": "mât, 日本"}
+
+
+def test_another_reader_finds_the_texts_and_the_picture() -> None:
+    png = bytes(cv2.imencode(".png", PICTURE)[1])
+    with PillowImage.open(io.BytesIO(with_text(png, TEXTS))) as opened:
+        opened.load()
+        assert opened.text == TEXTS  # type: ignore[attr-defined]
+        assert np.array_equal(np.asarray(opened), PICTURE)
 
 
 def test_the_quality_of_a_picture_is_plain_arithmetic() -> None:

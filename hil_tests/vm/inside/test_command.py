@@ -37,9 +37,10 @@ def test_a_check_tells_rate_losses_light_and_what_there_is(capsys: pytest.Captur
     assert "brightness" in {c["name"] for c in found["controls"]}  # type: ignore[attr-defined]
 
 
-def test_a_check_writes_the_last_picture(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_grabbed_picture_carries_its_time(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     file = tmp_path / "grey.png"
-    told(capsys, "check", BUS[0], "--seconds", "1", "--out", str(file), *SETTINGS)
+    found = told(capsys, "grab", BUS[0], "--out", str(file), *SETTINGS)
     with PillowImage.open(file) as opened:
         opened.load()
         assert opened.size == (640, 480) and opened.mode == "L"
+        assert opened.text["time_utc"] == found["time_utc"]  # type: ignore[attr-defined]
