@@ -40,8 +40,8 @@ class CameraFile:
 
     ``frame`` names the frame of the model's vectors, ``unknown`` where the format has no place for it.
     ``fit`` and ``provenance`` are carried through unread; a covariance in ``fit`` names its parameter order.
-    ``notes`` are sentences for the user: what was changed on reading, what was not read. ``path`` and
-    ``digest``, the SHA-256 of the bytes read, are None and empty for one made in the program.
+    ``notes`` are sentences for the user: what was changed on reading, what was not read. ``path`` is None for
+    one made in the program.
     """
 
     model: CameraModel
@@ -50,7 +50,6 @@ class CameraFile:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     path: Path | None = None
-    digest: str = ""
 
     def __post_init__(self) -> None:
         for name in ("fit", "provenance"):

@@ -21,7 +21,7 @@ from typing import cast
 import numpy as np
 
 from calib.errors import BadFile
-from calib.files import UNKNOWN_FRAME, CameraFile, build_model, digest_of, text_of
+from calib.files import UNKNOWN_FRAME, CameraFile, build_model, text_of
 from calib.geometry.cahvor import CameraModel, Kind
 
 _LINE = re.compile(r"\s*([A-Za-z]\w*(?: internal)?)\s*=\s*(.*?)\s*")
@@ -63,7 +63,7 @@ def parse_cahvor(data: bytes, path: str | Path) -> CameraFile:
         raise BadFile(path, "Dimensions", f"'{values['Dimensions'][0]}' where width and height are expected")
     model, notes = build_model(path, "", kind, (int(width), int(height)), vectors, cahvore_type, linearity)
     notes += tuple(f"{key} is not read" for key in unread)
-    return CameraFile(model, UNKNOWN_FRAME, {}, {}, notes, Path(path), digest_of(data))
+    return CameraFile(model, UNKNOWN_FRAME, {}, {}, notes, Path(path))
 
 
 def format_cahvor(model: CameraModel) -> bytes:

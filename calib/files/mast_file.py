@@ -345,7 +345,7 @@ def parse_camera(data: bytes, path: str | Path) -> CameraFile:
     """Read a camera file's bytes; ``path`` is for messages only. Raises BadFile as ``load_rig``."""
     record = parse_record(CameraFileRecord, data, path, CAMERA_SCHEMA)
     model, notes = _model(record, path, "")
-    return CameraFile(model, record.frame, record.fit, record.provenance, notes, Path(path), digest_of(data))
+    return CameraFile(model, record.frame, record.fit, record.provenance, notes, Path(path))
 
 
 def save_camera(camera: CameraFile, path: str | Path) -> CameraFile:

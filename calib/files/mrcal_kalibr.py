@@ -30,7 +30,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from calib.errors import BadFile
-from calib.files import UNKNOWN_FRAME, CameraFile, build_model, digest_of
+from calib.files import UNKNOWN_FRAME, CameraFile, build_model
 from calib.files.mast_file import SizePx
 from calib.files.opencv_ros import (
     Numbers,
@@ -111,10 +111,9 @@ def parse_mrcal(data: bytes, path: str | Path) -> CameraFile:
             numbers[:4],
             frame_from_camera,
             UNKNOWN_FRAME,
-            digest_of(data),
         )
     model, notes = _cahvor(source, record, name, frame_from_camera)
-    return CameraFile(model, UNKNOWN_FRAME, {}, {}, (*source.notes, *notes), Path(path), digest_of(data))
+    return CameraFile(model, UNKNOWN_FRAME, {}, {}, (*source.notes, *notes), Path(path))
 
 
 def _counted(source: Source, record: MrcalRecord, count: int) -> FloatArray:
@@ -243,7 +242,6 @@ def parse_kalibr(data: bytes, path: str | Path) -> dict[str, CameraFile]:
             record.intrinsics,
             camera_from_frame.inverse,
             frame,
-            digest_of(data),
         )
     return cameras
 

@@ -29,7 +29,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from calib.errors import BadFile
-from calib.files import LARGEST_IMAGE_PX, CameraFile, blind_notes, digest_of
+from calib.files import LARGEST_IMAGE_PX, CameraFile, blind_notes
 from calib.files.records import ABSENT, Number, Record, Text, problem, read_record
 from calib.files.twin import FISHEYE, ODD, LensFamily, kind_of_lens
 from calib.files.yaml_text import MAX_BYTES, MAX_DEPTH, dump_mapping, kind_of, parse_mapping
@@ -322,7 +322,6 @@ def parse_calibration(data: bytes, path: str | Path) -> CameraFile:
         np.array(record.camera_matrix)[[0, 4, 2, 5]],
         pose,
         record.frame,
-        digest_of(data),
     )
 
 
@@ -352,7 +351,6 @@ def lens_camera(
     intrinsics: Sequence[float] | FloatArray,
     frame_from_camera: Rigid,
     frame: str,
-    digest: str,
 ) -> CameraFile:
     """Return the camera of numbers that were read, with a note of the part of its image that has no ray.
 
@@ -389,7 +387,7 @@ def lens_camera(
     except ValueError as error:
         raise source.bad("", str(error)) from None
     notes = (*source.notes, *blind_notes(model, source.path, source.place))
-    return CameraFile(model, frame, {}, {}, notes, Path(source.path), digest)
+    return CameraFile(model, frame, {}, {}, notes, Path(source.path))
 
 
 def intrinsics_of(camera: CameraModel) -> FloatArray:

@@ -40,6 +40,11 @@ class Alignment:
     rejected: tuple[str, ...]
     doubt: str
 
+    @property
+    def agrees(self) -> bool:
+        """Whether all points fit."""
+        return not self.rejected and not self.doubt
+
 
 def align(
     points_in_a_m: ArrayLike,

@@ -78,11 +78,8 @@ def wrong_points(survey: Survey) -> Iterator[SurveyFinding]:
 
 def wrong_dots(survey: Survey) -> Iterator[SurveyFinding]:
     """Yield grids that are seen in a mirror."""
-    flipped = []
-    for name, dots in survey.dots.items():
-        spread = _dots_per_board(survey, dots)
-        if spread is not None and np.linalg.det(spread) < 0:
-            flipped.append(name)
+    spreads = {name: _dots_per_board(survey, dots) for name, dots in survey.dots.items()}
+    flipped = [name for name, spread in spreads.items() if spread is not None and np.linalg.det(spread) < 0]
     if flipped:
         yield SurveyFinding(
             "error",
@@ -149,13 +146,13 @@ def _disagreement(
         found = _on_design(design, seen, sigma_m)
     except NotAligned:
         return
-    if not found.rejected and not found.doubt:
+    if found.agrees:
         return
-    pairs = []
-    for a, b in combinations(sorted(seen), 2):
-        exchanged = _on_design(design, {**seen, a: seen[b], b: seen[a]}, sigma_m)
-        if not exchanged.rejected and not exchanged.doubt:
-            pairs.append((a, b))
+    pairs = [
+        (a, b)
+        for a, b in combinations(sorted(seen), 2)
+        if _on_design(design, {**seen, a: seen[b], b: seen[a]}, sigma_m).agrees
+    ]
     if len(pairs) == 1:
         yield SurveyFinding(
             "error",
@@ -175,9 +172,8 @@ def _disagreement(
         )
     else:
         # A sigma that is stated up to five times too small is no blunder: the fit finds it, and widens it.
-        wider = _on_design(design, seen, 5.0 * sigma_m)
         needed = what == "prism"
-        refused = needed and bool(wider.doubt or wider.rejected)
+        refused = needed and not _on_design(design, seen, 5.0 * sigma_m).agrees
         yield SurveyFinding(
             "error" if refused else "warning",
             place,

@@ -87,8 +87,12 @@ class BenchFolder:
         except OSError as error:
             raise NotWritten(self.path, "", f"cannot be written: {error.strerror or error}") from None
         stored = read_survey(self.path)
-        before, now = (dict(_leaves(plain(_document(one)))) for one in (stored, _as_known(header, stored)))
+        before, now = (dict(_leaves(plain(_document(one)))) for one in (stored, header))
+        both = [*stored.cameras.values(), *cameras.values()]
+        unknown = {camera.name for camera in both if camera.sensor_mode is None}  # and so no other
         for place in [*before, *now]:
+            if ".sensor_mode" in place and place.split(".")[1] in unknown:
+                continue
             if place not in before or place not in now or before[place] != now[place]:
                 was, wanted = (repr(one[place]) if place in one else "missing" for one in (before, now))
                 reason = f"is {was}, now it would be {wanted}; another folder (--survey) is expected"
@@ -121,16 +125,6 @@ class BenchFolder:
                 self._corners = found
         except OSError as error:
             raise NotWritten(self.path, image.name, f"cannot be written: {error.strerror or error}") from None
-
-
-def _as_known(header: Survey, stored: Survey) -> Survey:
-    """The header, with sensor modes as a folder has them where either does not know one."""
-    cameras = {}
-    for name, camera in header.cameras.items():
-        kept = stored.cameras[name].sensor_mode if name in stored.cameras else camera.sensor_mode
-        known = kept is not None and camera.sensor_mode is not None
-        cameras[name] = camera if known else replace(camera, sensor_mode=kept)
-    return replace(header, cameras=cameras)
 
 
 def _leaves(value: Any, place: str = "") -> Iterator[tuple[str, Any]]:
