@@ -239,7 +239,7 @@ def with_scales(
     for kind in dict.fromkeys(term.kind for term, _ in found.values()):
         mine = {name: one for name, (term, one) in found.items() if term.kind == kind}
         squares, freedom = np.array(list(mine.values())).T
-        typical = _median(squares, freedom)
+        typical = float(np.median(squares))
         like = np.array([not _odd(one, typical, np.inf) for one in mine.values()])
         if like.any():
             typical = float(np.sum((squares * freedom)[like]) / freedom[like].sum())
@@ -363,10 +363,3 @@ def _odd(one: Scatter, typical: float, freedom: float) -> bool:
     else:
         above = float(fdtrc(one.freedom, freedom, ratio))
     return 2 * min(above, 1.0 - above) < Level.STATED
-
-
-def _median(values: FloatArray, weights: FloatArray) -> float:
-    """The weighted median."""
-    order = np.argsort(values)
-    part = np.cumsum(weights[order])
-    return float(values[order][np.searchsorted(part, part[-1] / 2)])

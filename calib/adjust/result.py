@@ -12,6 +12,7 @@ from calib.adjust.gross import Outlier
 from calib.adjust.hypotheses import Finding
 from calib.adjust.model_terms import TermGain
 from calib.adjust.noise import Component
+from calib.adjust.terms import StationTerm
 from calib.adjust.unknowns import Estimate
 from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import FloatArray, Rigid
@@ -50,18 +51,6 @@ class ImageResiduals:
     range_m: float
     incidence_rad: float
     scatter: float = 1.0
-
-
-@dataclass(frozen=True, eq=False)
-class StationResidual:
-    """A prism or tape after the fit: measured less expected place (3,), metres, in the rover frame."""
-
-    kind: Literal["prism", "tape"]
-    setup: str
-    placement: str
-    point: str
-    residual_m: FloatArray
-    used: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,16 +117,17 @@ class FittedRig:
 class Calibration(FittedRig):
     """A rig fitted to a survey.
 
-    ``estimate`` (p,) are the values of the parameters; 0 for the two of an A or O, which count from the rig's
-    own. ``wider`` is the gain of further numbers, the likeliest first; empty where the method does not weigh.
-    ``prisms_in_rover_m`` are refined where the CAD has a sigma. ``unseen_clicks`` are check clicks on points
-    that their camera, as fitted, cannot see.
+    ``station`` are prisms and tapes, and their measured less expected places (3,), metres, in the rover
+    frame. ``estimate`` (p,) are the values of the parameters; 0 for the two of an A or O, which count from
+    the rig's own. ``wider`` is the gain of further numbers, the likeliest first; empty where the method does
+    not weigh. ``prisms_in_rover_m`` are refined where the CAD has a sigma. ``unseen_clicks`` are check clicks
+    on points that their camera, as fitted, cannot see.
     """
 
     method: Literal["paper", "joint"]
     mast_parameters: int
     estimate: FloatArray
-    station: tuple[StationResidual, ...]
+    station: tuple[tuple[StationTerm, FloatArray], ...]
     rover_from_station: Mapping[str, Rigid]
     prisms_in_rover_m: Mapping[str, FloatArray]
     wider: tuple[Finding, ...] = ()

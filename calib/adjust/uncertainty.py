@@ -15,7 +15,6 @@ from calib.adjust.result import (
     Degenerate,
     FittedRig,
     ImageResiduals,
-    StationResidual,
     rig_of,
 )
 from calib.adjust.terms import ImageTerm, lens_notes
@@ -127,22 +126,12 @@ def fitted_fields(
 
 def station_fields(survey: Survey, problem: Adjustment, state: Estimate) -> dict[str, Any]:
     """Return the fields of a `Calibration` that a survey has beyond those of a fitted rig."""
-    station = tuple(
-        StationResidual(
-            "prism" if p.board is None else "tape",
-            p.setup,
-            "" if p.board is None else p.board[1],
-            p.point,
-            off * p.sigma_m,
-            p.keep,
-        )
-        for p, off in zip(problem.station, problem.residuals(state, problem.station), strict=True)
-    )
+    off = problem.residuals(state, problem.station)
     clicks = _check_clicks(survey, state)
     return {
         "estimate": np.array(list(problem.values(state, "mast", "camera").values())),
         "unseen_clicks": tuple(click for click, _, off in clicks if not np.isfinite(off).all()),
-        "station": station,
+        "station": tuple((p, p.sigma_m * r) for p, r in zip(problem.station, off, strict=True)),
         "rover_from_station": state.rover_from_station,
         "prisms_in_rover_m": state.prisms_in_rover_m,
     }

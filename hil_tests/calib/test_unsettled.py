@@ -14,7 +14,6 @@ from calib.adjust import robust
 from calib.adjust import solver as least_squares
 from calib.adjust.terms import ImageTerm
 from calib.calibrate import body as fit_body_pose
-from calib.calibrate import paper as fit_paper
 from calib.calibrate import survey as fit_joint
 from calib.calibrate.starts import agreeing
 from calib.calibrate.starts.agreeing import Agreed
@@ -140,12 +139,6 @@ def test_a_survey_in_one_piece(navcams: Rig, stopped: Callable[..., None]) -> No
     stopped(robust)
     with pytest.raises(robust.SurveyNotFitted, match="did not settle"):
         fit_joint.fit_joint(survey_of(navcams, 2))
-
-
-def test_a_survey_as_the_paper_does_it(navcams: Rig, stopped: Callable[..., None]) -> None:
-    stopped(agreeing)
-    with pytest.raises(robust.SurveyNotFitted, match="settled"):
-        fit_paper.fit_paper(survey_of(navcams, 2))
 
 
 def test_a_mast_from_camera_models(navcams: Rig, stopped: Callable[..., None]) -> None:

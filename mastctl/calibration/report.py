@@ -217,9 +217,9 @@ def _terms(fit: BenchCalibration) -> Table:
 def _station_table(fit: Calibration) -> Table:
     """Rms of the residuals of prisms by set-up and of tapes by placement, worst first."""
     groups: dict[tuple[str, str, str], list[float]] = {}
-    for point in fit.station:
-        size_mm = 1000 * float(np.linalg.norm(point.residual_m))
-        groups.setdefault((point.kind, point.setup, point.placement), []).append(size_mm)
+    for point, off_m in fit.station:
+        group = point.kind, point.setup, point.board[1] if point.board else ""
+        groups.setdefault(group, []).append(1000 * float(np.linalg.norm(off_m)))
     rows = [
         [*group, f"{len(sizes)}", f"{np.sqrt(np.mean(np.square(sizes))):.2f}", f"{max(sizes):.2f}"]
         for group, sizes in groups.items()

@@ -437,7 +437,7 @@ def _left_out(fit: Calibration | BenchCalibration) -> list[Reason]:
             reasons.append(Reason("care", f"{left} of {count} {name} were left out; look for the cause"))
     prisms, tapes = ([o.name for o in fit.outliers if o.kind == kind] for kind in ("prism", "tape"))
     station = fit.station if isinstance(fit, Calibration) else ()
-    if prisms or len(tapes) > MANY_LEFT_OUT * sum(point.kind == "tape" for point in station):
+    if prisms or len(tapes) > MANY_LEFT_OUT * sum(point.board is not None for point, _ in station):
         reasons.append(Reason("care", f"measure again: {_some([*prisms, *tapes])}"))
     if not reasons and fit.outliers:
         reasons.append(Reason("good", f"{len(fit.outliers)} measurements were left out, each named"))
