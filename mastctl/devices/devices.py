@@ -130,7 +130,7 @@ class Devices(Cameras):
         self._sources: tuple[Callable[[], Sequence[StandingFault]], ...] = (self._faults,)
         self._published: dict[str, tuple[StandingFault, ...]] = {}  # faults by device
         self._comparing = threading.Lock()
-        self._watch = DeviceThread("faults", between=self.check_faults, clock=deadlines)
+        self._watch = DeviceThread("faults", between=self.check_faults, between_name="check", clock=deadlines)
 
     @property
     def last_reading(self) -> HeadReading | None:
