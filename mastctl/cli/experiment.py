@@ -56,13 +56,7 @@ def study_of(words: Sequence[str]) -> tuple[str, list[str]] | None:
 
 
 def become_study(name: str, options: Sequence[str]) -> NoReturn:
-    """Replace this process by a study of the checkout.
-
-    Raises
-    ------
-    WrongUse
-        If mastctl was installed without one.
-    """
+    """Replace this process by a study of the checkout. Raises WrongUse where there is none."""
     root = Path(mastctl.__file__).parents[1]
     if not (root / "tools" / "studies" / f"{name}.py").is_file():
         raise WrongUse(

@@ -171,13 +171,7 @@ def process() -> NoReturn:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code; never raises, never shows a traceback.
-
-    Parameters
-    ----------
-    argv
-        The words after ``mastctl``; those of the process by default.
-    """
+    """Run one command (``argv``: what follows ``mastctl``) and return its exit code; never raises."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:  # closed by whoever started us (>&-): then nobody reads

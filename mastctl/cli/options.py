@@ -122,16 +122,10 @@ def one_of(*options: Option, required: bool = False) -> Group:
 
 
 def option(usage: str, help: str, *, repeat: bool = False, **settings: Any) -> Option:
-    """Return an option or a positional argument.
+    """Return an option or a positional argument; ``usage`` as in the module's description.
 
-    Parameters
-    ----------
-    usage
-        As in the module's description.
-    repeat
-        Whether it may be given several times; its value is then a list.
-    settings
-        argparse's own, over those that follow from ``usage``. A default stands in the help too.
+    With ``repeat`` it may be given several times, and its value is a list. ``settings`` are argparse's own,
+    over those that follow from ``usage``. A default stands in the help too.
     """
     name, *values = usage.split()
     default = settings.get("default")
@@ -191,14 +185,9 @@ def command(
 ) -> Callable[[Run], Run]:
     """Return a decorator that makes a function a command.
 
-    Parameters
-    ----------
-    help
-        What it does; of a command of one word, `mastctl.cli.main.OVERVIEW` says it.
-    example
-        Options and arguments that a shell would take, which ``--help`` shows.
-    about
-        The description of its own ``--help``, where ``help`` is too short.
+    ``help`` says what it does (of a command of one word `mastctl.cli.main.OVERVIEW` says it), ``about`` is
+    the description of its own ``--help``, where that is too short. ``example`` are options and arguments
+    that a shell would take.
     """
 
     def declare(run: Run) -> Run:

@@ -127,16 +127,10 @@ class Sweep:
         self.seen = {name: Sightings() for name in cameras}
 
     def run(self, plan: SweepPlan) -> None:
-        """Sweep, and bring the head back to its start.
+        """Sweep, and bring the head back to its start; a camera's failure is in `seen`.
 
-        Raises
-        ------
-        Stopped
-            If it was stopped; the head is at rest there.
-        OutsideLimits, KeptOut
-            Before anything moves, if the sweep would pass a limit or a keep-out.
-        DriverError
-            If the head fails; it is halted. The failure of a camera is in `seen`.
+        Raises OutsideLimits and KeptOut before anything moves, if the sweep would pass a limit or a keep-out;
+        Stopped if it was stopped, and DriverError if the head fails: it is at rest then.
         """
         self._rest()
         start = self._devices.read()

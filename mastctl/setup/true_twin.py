@@ -59,14 +59,8 @@ def true_twin(believed: Rig, rng: np.random.Generator) -> Twin:
     """Return a true rig that ``believed`` could be the calibration of.
 
     It is drawn from a normal distribution about ``believed`` with the covariance of the file's fit, or with
-    that of a usual calibration (``STATED``) where the file has none.
-
-    Raises
-    ------
-    CalibError
-        If the covariance of the file is none.
-    BadRig
-        If what is drawn is no camera any more: the covariance is far too wide.
+    that of a usual calibration (``STATED``) where the file has none. Raises CalibError if the covariance of
+    the file is none, BadRig if what is drawn is no camera any more: it is far too wide.
     """
     known = stored_covariance(believed)
     by = "stated sigmas" if known is None else "fit.covariance"

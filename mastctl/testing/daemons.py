@@ -121,14 +121,7 @@ def config_for_a_test(
 
     ``simulation`` has keys in place of that section's; a file without them gets one ray a pixel, and ``speed:
     max`` if its head has no wire. New mast files, for another width of the images, are written into
-    ``folder``.
-
-    Raises
-    ------
-    BadFile
-        As `load_config`.
-    BadOptions
-        If a device of it is not simulated.
+    ``folder``. Raises BadFile as `load_config`, and BadOptions if a device of it is not simulated.
     """
     config = load_config(path)
     if real := not_simulated(config.hardware):
@@ -164,14 +157,8 @@ def with_width(config: Config, width_px: int, folder: Path) -> Config:
     """Return a configuration whose cameras, as believed and as they truly are, have pictures of a width.
 
     They see what they saw before, in as many more or fewer pixels. Both mast files are written into
-    ``folder``.
-
-    Raises
-    ------
-    BadOptions
-        For a width that is none, or a true rig that cannot be read.
-    BadFile
-        For a mast file that cannot be read.
+    ``folder``. Raises BadOptions for a width that is none, or a true rig that cannot be read, and BadFile for
+    a mast file that cannot be read.
     """
     if isinstance(width_px, bool) or not isinstance(width_px, int) or not 64 <= width_px <= WIDEST_PX:
         raise BadOptions(

@@ -35,11 +35,12 @@ INI = {
     "mastctl_samples": "simulation.samples, rays a pixel each way (default: the configuration's, or 1)",
 }
 
-_LOG = pytest.StashKey["_Log"]()
+_LOG = pytest.StashKey[tuple[Path, int]]()
+"""The daemons' log, and how much of it is of before."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Say which options a project's configuration may hold."""
+    """Declare the options of a project's configuration."""
     for name, meaning in INI.items():
         parser.addini(name, meaning, type="string", default="")
 
@@ -62,78 +63,48 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> None:
-    """Show with a failure what the test's daemon said."""
-    log = item.stash.get(_LOG, None)
-    if log is not None and call.excinfo is not None:
-        item.add_report_section(call.when, MARKER, log.new())
-
-
-class _Log:
-    """What daemons said since a test began."""
-
-    def __init__(self, file: Path) -> None:
-        self._file = file
-        self._read = file.stat().st_size
-
-    def new(self) -> str:
-        with self._file.open("rb") as log:
-            log.seek(self._read)
-            data = log.read()
-        self._read += len(data)
-        return data.decode(errors="replace")
-
-
-class _Processes:
-    """The process of this worker's daemons: made when first wanted, and anew if it has died."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._process: RoverProcess | None = None
-        self._opened = 0
-
-    def process(self) -> RoverProcess:
-        from mastctl.testing.process import RoverProcess
-
-        if self._process is None or not self._process.alive:
-            self.close()
-            workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
-            self._process = RoverProcess(self._folder / "daemon.log", workers)
-        return self._process
-
-    def folder(self) -> Path:
-        """An empty folder for one daemon."""
-        self._opened += 1
-        folder = self._folder / str(self._opened)
-        folder.mkdir()
-        return folder
-
-    def close(self) -> None:
-        """End the process, if there is one."""
-        if self._process is not None:
-            self._process.close()
-            self._process = None
+    """Show with a failure what the test's daemon logged."""
+    file, read = item.stash.get(_LOG, (None, 0))
+    if file is not None and call.excinfo is not None:
+        data = file.read_bytes()[read:]
+        item.stash[_LOG] = (file, read + len(data))
+        item.add_report_section(call.when, MARKER, data.decode(errors="replace"))
 
 
 @pytest.fixture(scope="session")
-def _mast_processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[_Processes]:
-    processes = _Processes(tmp_path_factory.mktemp("mastctl"))
-    try:
-        yield processes
-    finally:
-        processes.close()
+def _mast_process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[], RoverProcess]]:
+    """Returns the process of this worker's daemons: made when first wanted, and anew if it has died."""
+    folder, made = tmp_path_factory.mktemp("mastctl"), list[Any]()
+
+    def process() -> RoverProcess:
+        from mastctl.testing.process import RoverProcess
+
+        if not made or not made[-1].alive:
+            workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+            made.append(RoverProcess(folder / "daemon.log", workers))
+        found: RoverProcess = made[-1]
+        return found
+
+    yield process
+    for one in made:
+        one.close()
 
 
 @pytest.fixture
-def simulated_rover(request: pytest.FixtureRequest, _mast_processes: _Processes) -> Iterator[SimulatedRover]:
+def simulated_rover(
+    request: pytest.FixtureRequest,
+    _mast_process: Callable[[], RoverProcess],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[SimulatedRover]:
     """The simulated rover of this test, with a daemon of its own that has just started."""
     from mastctl.testing.rover import RoverError, SimulatedRover
 
-    process = _mast_processes.process()
-    request.node.stash[_LOG] = _Log(process.log)
+    process = _mast_process()
+    request.node.stash[_LOG] = (process.log, process.log.stat().st_size)
     url = refusal = ""
     try:
         options = _options(request)
-        url = process.open({**options, "folder": str(_mast_processes.folder())})
+        url = process.open({**options, "folder": str(tmp_path_factory.mktemp("rover"))})
     except (RoverError, ValueError) as error:
         refusal = str(error)
     if refusal:
@@ -142,7 +113,7 @@ def simulated_rover(request: pytest.FixtureRequest, _mast_processes: _Processes)
     try:
         process.request("close")
     except RoverError:  # it has died, or hangs: the next test gets another one
-        _mast_processes.close()
+        process.close()
 
 
 @pytest.fixture
@@ -162,7 +133,7 @@ def mast_client(mast_daemon: str) -> Iterator[Client]:
 
 @pytest.fixture
 def fault(simulated_rover: SimulatedRover) -> Callable[..., SetFault]:
-    """``fault(device, word, **parameters)`` sets a fault; the end of the test takes it back."""
+    """``fault(device, word, **parameters)`` sets a fault; the end of the test clears it."""
     return simulated_rover.set_fault
 
 

@@ -47,11 +47,7 @@ class SimulatedRover:
 
     Values named true are those that the daemon never reads: the mechanical angles, with backlash and sag, and
     the true cameras. Every method raises `RoverError` when the daemon's process has ended.
-
-    Attributes
-    ----------
-    url
-        The daemon's address.
+    ``url`` is the daemon's address.
     """
 
     def __init__(self, request: Request, url: str) -> None:
