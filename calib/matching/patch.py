@@ -57,10 +57,9 @@ class MatchSettings:
     apart_px: int = 5  # peaks nearer than this are one peak
     worst_sigma_px: float = 0.5  # a position less certain is no measurement
     roughness: float = 0.01
-    """How far the target may lie off the patch's plane, one sigma, as a part of the patch's half extent on
-    it. It matters as far as the two cameras are apart. 0 for what is known to be plane; the default is what
-    makes sigmas true on the simulated rover's ground and rocks."""
-    rough_beside_relief: bool = True  # also where two cameras saw what stands off the plane
+    """How far the target may lie off the patch's plane, one sigma, as a part of the patch's half extent on it,
+    where no two cameras saw the relief. It matters as far as the two cameras are apart. 0 for what is known to
+    be plane; the default is what makes sigmas true on the simulated rover's ground and rocks."""
     near_px: float = 0.0
     """By how much nearer pixels count more in the refinement: one sigma of a Gaussian that is round on the
     surface and as large as a circle of this radius in the destination. 0: all of the patch alike."""
@@ -132,7 +131,7 @@ def match_patch(
     if isinstance(found, PatchMatch):
         return found
     refined, best, second = found
-    roughness = settings.roughness if relief is None or settings.rough_beside_relief else 0.0
+    roughness = settings.roughness if relief is None else 0.0
     if settings.relief > 0:
         expected = expected_correlation(template.values, settings, template.counts)
         roughness *= 1.0 + max(0.0, 1.0 - refined.correlation / expected) / settings.relief

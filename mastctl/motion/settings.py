@@ -58,9 +58,7 @@ class PointingSettings:
     shows is added, so that a position on rough ground is reported as less sure."""
     small_half_px: int = 12  # half patch that is tried after a move where the usual one fits nowhere
     match: MatchSettings = field(
-        default_factory=partial(
-            MatchSettings, roughness=0.02, rough_beside_relief=False, relief=0.01, least_lead=0.03
-        )
+        default_factory=partial(MatchSettings, roughness=0.02, relief=0.01, least_lead=0.03)
     )
     """``roughness`` and ``relief`` decide sigmas only, and only where no second camera saw the surface. A
     second place may fit a little better than elsewhere, as along a rock's smooth edge: the prediction and the
