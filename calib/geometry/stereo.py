@@ -204,7 +204,7 @@ def _times(a: FloatArray, b: FloatArray) -> FloatArray:
 PIXEL_M = 4.65e-6
 
 PAPER_PAIRS = (("pancam", 16.0e-3, 0.30), ("navcam", 6.0e-3, 0.20), ("hazcam", 2.3e-3, 0.10))
-"""Names, focal lengths and baselines of the paper's stereo pairs, metres."""
+"""Names, focal lengths and baselines of the paper's stereo pairs, metres, the longest focal length first."""
 
 
 class BudgetRow(NamedTuple):
@@ -227,14 +227,11 @@ def stereo_range_error_m(
     return range_m * range_m / (focal_px * baseline_m) * disparity_error_px
 
 
-def target_approach_budget(
-    pairs: tuple[tuple[str, float, float], ...] = PAPER_PAIRS, pixel_m: float = PIXEL_M
-) -> tuple[BudgetRow, ...]:
+def target_approach_budget() -> tuple[BudgetRow, ...]:
     """Return the rows of Table I, one for each pair as the one the approach from 10 m to 1 m starts with.
 
-    The pairs go from the longest focal length to the shortest; the last is the one that places the
-    instrument. The pixel size gives focal lengths in pixels, eq. (2). 3 sigma are 1 pixel of stereo at the
-    start, and 2 % of the distance there of navigation.
+    The last pair is the one that places the instrument. The pixel size gives focal lengths in pixels, eq.
+    (2). 3 sigma are 1 pixel of stereo at the start, and 2 % of the distance there of navigation.
 
     While the target grows its place in the image is known no better than the first pixel was. The paper takes
     half of that growth as the disparity error at the end: ±5 pixels. A hand-off scales it by the ratio of
@@ -244,10 +241,10 @@ def target_approach_budget(
     start_m, end_m, disparity_error_px, odometry_error = 10.0, 1.0, 1.0, 0.02
     grown_error_px = 0.5 * disparity_error_px * start_m / end_m
     rows = []
-    for name, focal_m, baseline_m in pairs:
-        focal_px = focal_m / pixel_m
+    for name, focal_m, baseline_m in PAPER_PAIRS:
+        focal_px = focal_m / PIXEL_M
         stereo_m = stereo_range_error_m(start_m, focal_px, baseline_m, disparity_error_px)
         untracked_m = math.hypot(stereo_m, odometry_error * start_m)
-        tracked_m = stereo_range_error_m(end_m, focal_px, pairs[-1][2], grown_error_px)
+        tracked_m = stereo_range_error_m(end_m, focal_px, PAPER_PAIRS[-1][2], grown_error_px)
         rows.append(BudgetRow(name, 100.0 * stereo_m, 100.0 * untracked_m, 100.0 * tracked_m))
     return tuple(rows)

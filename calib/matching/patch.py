@@ -57,9 +57,9 @@ class MatchSettings:
     apart_px: int = 5  # peaks nearer than this are one peak
     worst_sigma_px: float = 0.5  # a position less certain is no measurement
     roughness: float = 0.01
-    """How far the target may lie off the patch's plane, one sigma, as a part of the patch's half extent on it,
-    where no two cameras saw the relief. It matters as far as the two cameras are apart. 0 for what is known to
-    be plane; the default is what makes sigmas true on the simulated rover's ground and rocks."""
+    """How far the target may lie off the patch's plane, one sigma, as a part of the patch's half extent on
+    it, where no two cameras saw the relief. It matters as far as the two cameras are apart. 0 for what is
+    known to be plane; the default makes sigmas true on the simulated rover's ground and rocks."""
     near_px: float = 0.0
     """By how much nearer pixels count more in the refinement: one sigma of a Gaussian that is round on the
     surface and as large as a circle of this radius in the destination. 0: all of the patch alike."""
