@@ -109,31 +109,22 @@ def stored_covariance(rig: Rig) -> RigCovariance | None:
     if strange := [name for name in names if name not in known]:
         raise CalibError(f"fit.parameters of the mast file names {strange[0]!r}, which the rig does not have")
     try:
-        covariance = np.array(rig.fit["covariance"], dtype=np.float64)
+        stored = RigCovariance(tuple(names), rig.fit["covariance"])
     except (TypeError, ValueError):
-        covariance = np.empty(0)
-    square = covariance.shape == (len(names), len(names))
-    if not square or not np.isfinite(covariance).all() or (np.diag(covariance) < 0).any():
         raise CalibError(
             f"fit.covariance of the mast file is not {len(names)} rows of {len(names)} numbers with a "
             "positive diagonal, as many as fit.parameters names"
-        )
-    if _impossible(covariance):
+        ) from None
+    scale = np.sqrt(np.diag(stored.covariance))
+    scale[scale == 0.0] = 1.0
+    scaled = stored.covariance / np.outer(scale, scale)
+    least = np.linalg.eigvalsh(scaled).min(initial=0.0)
+    if least < -ROUNDING or np.abs(scaled - scaled.T).max(initial=0.0) > ROUNDING:
         raise CalibError(
             "fit.covariance of the mast file is none: it is not symmetric, or some direction has a negative "
             "variance"
         )
-    return RigCovariance(tuple(names), covariance)
-
-
-def _impossible(covariance: FloatArray) -> bool:
-    """Whether a matrix with a positive diagonal is no covariance, beyond what rounding does."""
-    scale = np.sqrt(np.diag(covariance))
-    scale[scale == 0.0] = 1.0
-    scaled = covariance / np.outer(scale, scale)
-    if np.abs(scaled - scaled.T).max(initial=0.0) > ROUNDING:
-        return True
-    return bool(np.linalg.eigvalsh(scaled).min(initial=0.0) < -ROUNDING)
+    return stored
 
 
 def moved_rig(rig: Rig, names: Sequence[str], step: FloatArray) -> Rig:

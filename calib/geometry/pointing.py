@@ -148,8 +148,8 @@ def ordered(
     ------
     Unreachable
         ``outside_limits``: with the angle, the limit and by how much, for the solution that misses least.
-        ``bad_joints``: a limit or an angle is not a number, a limit's lowest is above its highest, or there
-        is no solution to choose from.
+        ``bad_joints``: a limit or where the head is is not a number, a limit's lowest is above its highest,
+        or there is no solution to choose from.
     """
     _refuse_present(from_pan_rad, from_tilt_rad)
     read = read or _true_angles
@@ -162,11 +162,6 @@ def ordered(
             )
     if not solutions:
         raise Unreachable("bad_joints", "there is no solution to choose from")
-    for one in solutions:
-        if not (math.isfinite(one.pan_rad) and math.isfinite(one.tilt_rad)):
-            raise Unreachable(
-                "bad_joints", f"a solution has pan {one.pan_rad} and tilt {one.tilt_rad} rad: no angles"
-            )
     turns = (0.0, math.tau, -math.tau)
     turned = [
         Solution(one.pan_rad + pan, one.tilt_rad + tilt, one.range_m)

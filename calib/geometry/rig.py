@@ -71,8 +71,6 @@ class AxisJoint:
         if len(self.harmonics_rad) > MOST_HARMONICS:
             count = len(self.harmonics_rad)
             raise ValueError(f"harmonics_rad has {count} pairs where {MOST_HARMONICS} at most are expected")
-        if any(len(pair) != 2 for pair in self.harmonics_rad):
-            raise ValueError("harmonics_rad holds something else than pairs [c, s]")
         clean = tuple(
             (finite_float("harmonics_rad", c), finite_float("harmonics_rad", s))
             for c, s in self.harmonics_rad

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calib.errors import NoStereoPoint
 from calib.geometry.cahvor import CameraModel, Rays
-from calib.geometry.rigid import FloatArray, finite_float
+from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import triangulate
 from calib.matching.patch import (
     MatchSettings,
@@ -78,11 +78,8 @@ def find_partner(
 ) -> StereoMatch:
     """Find where the partner shows what the own image, of the same moment, shows at a pixel (2,).
 
-    Their common frame has z down. The sweep starts at ``nearest_m``; ValueError if that is no finite distance
-    ahead.
+    Their common frame has z down. The sweep starts at ``nearest_m``.
     """
-    if not finite_float("nearest_m", nearest_m) > 0.0:
-        raise ValueError(f"nearest_m is {nearest_m} where a distance above 0 is expected")
     settings = settings or MatchSettings()
     pixel = np.asarray(pixel_px, dtype=np.float64)
     # Most of the patch may lie on something nearer or farther than the target: then a smaller one is tried.

@@ -107,11 +107,9 @@ def match_patch(
     """Find the target at ``source_px`` (2,) of one picture in another.
 
     ``plane`` is the scene around the target, in the images' common frame, ``search_px`` half the side of the
-    window around the predicted place, destination pixels (ValueError if that has no finite size). Pixels that
-    do not belong to the surface by the ``relief`` are left out.
+    window around the predicted place, destination pixels. Pixels that do not belong to the surface by the
+    ``relief`` are left out.
     """
-    if not 0.0 <= search_px < math.inf:
-        raise ValueError(f"search_px is {search_px} where a finite number, 0 or more, is expected")
     settings = settings or MatchSettings()
     target = np.asarray(source_px, dtype=np.float64)
     seen, valid = carry(target, source.camera, plane, destination.camera)

@@ -51,10 +51,7 @@ Slopes = tuple[FloatArray, FloatArray]
 class OpencvLens:
     """One lens of 4, 5, 8, 12 or 14 coefficients; one that folds at its axis has no image.
 
-    Raises
-    ------
-    ValueError
-        If there are other counts of them, they are not finite, or the plane is turned by 1.5 rad or more.
+    ValueError if the plane is turned by 1.5 rad or more.
     """
 
     distortion: tuple[float, ...]
@@ -62,11 +59,6 @@ class OpencvLens:
     curved = False
 
     def __post_init__(self) -> None:
-        if len(self.distortion) not in COUNTS:
-            expected = ", ".join(map(str, COUNTS))
-            raise ValueError(f"{len(self.distortion)} coefficients of a lens where {expected} are expected")
-        if not isfinite(sum(self.distortion)):
-            raise ValueError(f"distortion {list(self.distortion)} holds a value that is not finite")
         if max(map(abs, self.distortion[12:]), default=0.0) >= MOST_TURN_RAD:
             raise ValueError(f"the image is turned by {MOST_TURN_RAD:g} rad or more")
 
