@@ -171,12 +171,16 @@ class Slip:
 
 @dataclass(frozen=True)
 class SeamError:
-    """What seams measure: rms of dx and dy, px of the camera; what the matches explain of it; how many."""
+    """What seams measure: rms of dx and dy, px of the camera; what the matches explain of it; how many.
+
+    ``across_px``: rms across the parallax, which no relief of the scene moves, with the matches' own.
+    """
 
     rms_px: tuple[float, float]
     sigma_px: tuple[float, float]
+    across_px: tuple[float, float]
     count: int
-    left_out: int = 0
+    left_out: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,10 +216,15 @@ def seam_error(patches: Sequence[SeamPatch]) -> SeamError:
     off = np.array([patch.off_px for patch in patches])
     spread = 1.4826 * np.median(np.abs(off - np.median(off, axis=0)), axis=0)
     kept = (np.abs(off - np.median(off, axis=0)) <= GROSS_SIGMA * np.maximum(spread, 0.02)).all(axis=1)
-    variances = np.array([np.diag(patch.covariance_px2) for patch in patches])[kept]
+    covariances = np.array([patch.covariance_px2 for patch in patches])
+    along = np.array([patch.parallax_px_m for patch in patches])
+    side = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-12)
+    across = np.einsum("ni,ni->n", side, off), np.sqrt(np.einsum("ni,nij,nj->n", side, covariances, side))
     x, y = np.sqrt(np.mean(off[kept] ** 2, axis=0)).tolist()
-    sx, sy = np.sqrt(np.mean(variances, axis=0)).tolist()
-    return SeamError((x, y), (sx, sy), int(kept.sum()), int((~kept).sum()))
+    sx, sy = np.sqrt(np.mean(covariances[kept][:, (0, 1), (0, 1)], axis=0)).tolist()
+    a, sa = (float(np.sqrt(np.mean(one[kept] ** 2))) for one in across)
+    return SeamError((x, y), (sx, sy), (a, sa), int(kept.sum()), int((~kept).sum()))
 
 
 def slip_of(

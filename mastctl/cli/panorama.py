@@ -250,9 +250,9 @@ def _shown(folder: Path, index: Index) -> list[str | Shown]:
         width, height = index.mosaic.size_px
         lines.append(f"mosaic: {width}x{height} px, {index.mosaic.projection}, for {index.mosaic.surface}")
     if index.whole is not None:
-        (x, y), (sx, sy) = index.whole.rms_px, index.whole.sigma_px
+        (x, y), (across, matched) = index.whole.rms_px, index.whole.across_px
         lines.append(
-            f"seams: {x:.3f}, {y:.3f} px rms of {index.whole.count} patches "
-            f"(the matches alone: {sx:.3f}, {sy:.3f} px)"
+            f"seams: {x:.3f}, {y:.3f} px rms of {index.whole.count} patches; across the parallax "
+            f"{across:.3f} px (the matches alone {matched:.3f} px)"
         )
     return lines + ([index.slip.sentence] if index.slip is not None else [])

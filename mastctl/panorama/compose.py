@@ -14,6 +14,7 @@ from calib.geometry.mosaic import Canvas, MosaicSurface, Projection, canvas_of
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
 from calib.matching.mosaic import Picture, SeamError, Slip, composed, frames_of, gains_of, seams_of, slip_of
+from mastctl.as_json import as_json
 from mastctl.errors import BadRequest
 from mastctl.panorama.folder import (
     MOSAIC,
@@ -136,10 +137,7 @@ def picture_at(folder: Folder, pixel_px: tuple[float, float], rig: Rig | None = 
 
 
 def _seam(views: list[int], error: SeamError) -> SeamRecord:
-    return SeamRecord(
-        views=views, rms_px=list(error.rms_px), sigma_px=list(error.sigma_px), count=error.count,
-        left_out=error.left_out,
-    )  # fmt: skip
+    return SeamRecord(views=views, **as_json(error))
 
 
 def _slip(slip: Slip, numbers: list[int]) -> SlipRecord:

@@ -117,11 +117,15 @@ class MosaicRecord(Record):
 
 
 class SeamRecord(Record):
-    """The error of a seam, or of all: rms of dx and dy, px, what the matches explain of it, their count."""
+    """The error of a seam, or of all (no ``views``): rms of dx and dy, px, what the matches explain of it.
+
+    ``across_px``: rms across the parallax, which the scene's relief does not move, and the matches' own.
+    """
 
     views: list[Count]
     rms_px: Pair
     sigma_px: Pair
+    across_px: Pair
     count: Count
     left_out: Count
 

@@ -46,7 +46,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Found:
-    """What one scene showed: clicks, seams' rms and expected px, named slips."""
+    """What one scene showed: clicks, seams' rms (x, y, across, of matches), named slips."""
 
     clicks: list[TrueClick]
     seams_px: tuple[float, ...]
@@ -64,7 +64,7 @@ def found_in(task: Scene) -> Found:
             assert rover is not None
             folder = taken(client, Path(state))
             assert folder.index.whole is not None
-            seams = (*folder.index.whole.rms_px, *folder.index.whole.sigma_px)
+            seams = (*folder.index.whole.rms_px, *folder.index.whole.across_px)
             clicks = [click(client, rover, folder, rng) for _ in range(task.cases)]
             slips = [slipped(client, folder, rover, axis) for axis in (0, 1)] if task.number == 0 else []
     return Found(clicks, seams, slips)
@@ -139,7 +139,7 @@ COLUMNS = {
     "clicks": "{cases}", "refused, %": "{refused_percent:.0f}", "of these hidden": "{refused_hidden}",
     "z rms": "{z_rms:.2f}", "worst": "{worst_z:.1f}",
     "error rms, px": "{error_rms_px[0]:.3f}, {error_rms_px[1]:.3f}",
-    "seams, px": "{seams_px[0]:.3f}, {seams_px[1]:.3f}", "by matches": "{seams_px[2]:.3f}, {seams_px[3]:.3f}",
+    "seams, px": "{seams_px[0]:.3f}, {seams_px[1]:.3f}", "across": "{seams_px[2]:.3f}", "matches": "{seams_px[3]:.3f}",
 }  # fmt: skip
 
 
