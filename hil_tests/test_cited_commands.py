@@ -41,8 +41,8 @@ CHEAP = [
     "tools.studies.handoff --simulated --targets 1",
 ]
 
-ELSEWHERE = {"tools.dist", "tools.simulated.mast", "tools.mutants"}
-"""Run by test_packaging and test_simulated_mast; needs Cosmic Ray, which is installed by hand."""
+ELSEWHERE = {"tools.dist", "tools.simulated.mast"}
+"""Run by test_packaging and test_simulated_mast."""
 
 
 def cited() -> Iterator[tuple[str, str, str]]:

@@ -19,7 +19,6 @@ GIVEN = {
     *("rclpy", "builtin_interfaces", "diagnostic_msgs", "geometry_msgs", "sensor_msgs"),
     *("std_msgs", "std_srvs", "trajectory_msgs"),  # ROS 2 brings these
     "mrcal",  # Debian's package
-    "cosmic_ray",  # installed by hand for a sample of mutants
     "bench_rig",  # a package that a test installs
 }
 

@@ -139,7 +139,8 @@ COLUMNS = {
     "clicks": "{cases}", "refused, %": "{refused_percent:.0f}", "of these hidden": "{refused_hidden}",
     "z rms": "{z_rms:.2f}", "worst": "{worst_z:.1f}",
     "error rms, px": "{error_rms_px[0]:.3f}, {error_rms_px[1]:.3f}",
-    "seams, px": "{seams_px[0]:.3f}, {seams_px[1]:.3f}", "across": "{seams_px[2]:.3f}", "matches": "{seams_px[3]:.3f}",
+    "seams, px": "{seams_px[0]:.3f}, {seams_px[1]:.3f}",
+    "across": "{seams_px[2]:.3f}", "matches": "{seams_px[3]:.3f}",
 }  # fmt: skip
 
 
