@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from calib.geometry.mosaic import MosaicSurface, canvas_of
+from calib.geometry.rigid import Rigid
 from drivers.clock import ManualClock
+from tools.against_others import stitching
 from tools.flight.difference import model_difference
 
 MODELS_MM, MODELS_MRAD = 0.003, 0.003
@@ -114,3 +117,13 @@ def test_a_picture_from_elsewhere_matches_nothing(mer: ModuleType, views: list[A
     elsewhere = replace(views[2], image=views[0].image)
     _, found = mer.carried_features(elsewhere, views[3])
     assert len(found) <= 2
+
+
+def test_a_mosaic_by_label_models_meets_across_the_parallax_better_than_stitching() -> None:
+    cameras, pictures = stitching.flight_pictures()
+    origin = Rigid(np.eye(3), np.mean([camera.C for camera in cameras], axis=0))
+    canvas = canvas_of(cameras, origin, MosaicSurface.of("ground"))
+    known, seams = stitching.ours(canvas, cameras, pictures)
+    assert known["pictures"] == 5 and known["patches"] >= 6
+    assert known["across_px"] < ACROSS_MEDIAN_PX
+    assert stitching.opencv(pictures, seams)["pictures"] < 5, "two frames have too little in common for it"

@@ -60,7 +60,7 @@ def opencv(pictures: list[Picture], seams: Any) -> dict[str, Any]:
     cv2.setRNGSeed(1)
     colour = [cv2.cvtColor(one, cv2.COLOR_GRAY2BGR) if one.ndim == 2 else one for one in pictures]
     stitching: Any = cv2
-    features = [stitching.detail.computeImageFeatures2(cv2.SIFT_create(), one) for one in colour]
+    features = [stitching.detail.computeImageFeatures2(stitching.SIFT_create(), one) for one in colour]
     matches = stitching.detail_BestOf2NearestMatcher(False, CONFIDENCE).apply2(features)
     kept = [
         int(one) for one in np.ravel(stitching.detail.leaveBiggestComponent(features, matches, CONFIDENCE))
