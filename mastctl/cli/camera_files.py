@@ -17,7 +17,7 @@ from mastctl.cli.geometry import (
     stereo_pair,
     tell_notes,
 )
-from mastctl.cli.options import at_least, command, option
+from mastctl.cli.options import command, option
 from mastctl.cli.output import Answer, CommandError, WrongUse, tables_of
 
 if TYPE_CHECKING:
@@ -183,12 +183,13 @@ def _chosen_model(args: argparse.Namespace) -> CameraModel:
     example="mast.yaml --pair navcam --out maps.npz",
 )
 def camera_maps(args: argparse.Namespace) -> Answer:
-    """Write the maps, the new camera's matrix and vectors, and for a pair OpenCV's Q."""
+    """Write the maps, the new camera's K (3, 3) and C, A, H, V (3,), and for a pair OpenCV's Q."""
     import io
 
     import numpy as np
 
     from calib.files import save_bytes
+    from calib.files.any_camera import load_any
     from calib.geometry.maps import ideal_camera, maps_between, rectified_pair
 
     if args.out.suffix != ".npz":
@@ -196,14 +197,10 @@ def camera_maps(args: argparse.Namespace) -> Answer:
     output.check_file(args.out, "--out")
     arrays: dict[str, np.ndarray] = {}
     if args.pair is None:
-        from calib.files.any_camera import load_any
-
         name, camera = camera_of(load_any(args.file), args.camera)
         tell_notes(camera.notes)
         new = ideal_camera(camera.model, args.focal_px)
-        maps = maps_between(new, camera.model)
-        arrays |= {"map_x": maps.map_x, "map_y": maps.map_y, **_camera_arrays(new, "")}
-        frame, shown = camera.frame, {name: maps}
+        frame, made = camera.frame, [("", name, new, maps_between(new, camera.model))]
     else:
         if args.camera is not None:
             raise WrongUse("--camera and --pair: one of them is expected")
@@ -216,29 +213,21 @@ def camera_maps(args: argparse.Namespace) -> Answer:
             pair = rectified_pair(left.model, right.model, args.focal_px)
         except ValueError as error:
             raise CommandError("no_pair", f"{args.pair}: {error}") from None
-        arrays["Q"] = pair.depth
-        for side, new, maps in (("left", pair.left, pair.left_maps), ("right", pair.right, pair.right_maps)):
-            arrays |= {
-                f"{side}_map_x": maps.map_x,
-                f"{side}_map_y": maps.map_y,
-                **_camera_arrays(new, f"{side}_"),
-            }
-        frame, shown = left.on, dict(zip(names, (pair.left_maps, pair.right_maps), strict=True))
+        arrays["Q"], frame = pair.depth, left.on
+        made = [
+            ("left_", names[0], pair.left, pair.left_maps), ("right_", names[1], pair.right, pair.right_maps)
+        ]  # fmt: skip
+    seen = {}
+    for before, name, new, maps in made:
+        (fx, fy), cx, cy = new.focal_px, new.H @ new.A, new.V @ new.A
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        arrays |= {f"{before}map_x": maps.map_x, f"{before}map_y": maps.map_y, f"{before}K": matrix}
+        arrays |= {f"{before}{letter}": getattr(new, letter) for letter in "CAHV"}
+        seen[name] = float((maps.map_x >= 0.0).mean())
     archive = io.BytesIO()
     np.savez_compressed(archive, **arrays)  # type: ignore[arg-type]  # names are names
     save_bytes(args.out, archive.getvalue())
-    seen = {name: float((maps.map_x >= 0.0).mean()) for name, maps in shown.items()}
     return Answer({"out": str(args.out), "frame": frame, "arrays": sorted(arrays), "shown": seen})
-
-
-def _camera_arrays(camera: CameraModel, before: str) -> dict[str, np.ndarray]:
-    """The new camera: K (3, 3), and C, A, H, V (3,)."""
-    import numpy as np
-
-    cx, cy = camera.H @ camera.A, camera.V @ camera.A
-    fx, fy = camera.focal_px
-    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    return {f"{before}K": matrix, **{f"{before}{letter}": getattr(camera, letter) for letter in "CAHV"}}
 
 
 @command(
@@ -254,9 +243,6 @@ def _camera_arrays(camera: CameraModel, before: str) -> dict[str, np.ndarray]:
         default=[1],
     ),
     option("--flip none|horizontal|vertical|both", "after crop and binning", default="none"),
-    option(
-        "--size WIDTH HEIGHT", "of the camera's pictures, to be compared with the result", type=at_least(1)
-    ),
     option("--out NEW.yaml", "the mast file to write", required=True),
     help="write a mast file for a crop, binning or flip of the calibrated pictures of a camera",
     example="mast.yaml --camera navcam_left --bin 2 --flip both --out binned.yaml",
@@ -273,16 +259,8 @@ def camera_mode(args: argparse.Namespace) -> Answer:
     name = camera_name(stored, args.camera)
     crop_px = None if args.crop is None else (args.crop[0], args.crop[1], args.crop[2], args.crop[3])
     mode = Mode(crop_px, (args.bin[0], args.bin[-1]), FLIPS[args.flip])
-    calibrated_px = stored.rig.cameras[name].model.size_px
     rig = rig_in_mode(stored.rig, name, mode)
     size_px = rig.cameras[name].model.size_px
-    if args.size is not None and size_px != tuple(args.size):
-        raise CommandError(
-            "bad_mode",
-            f"{mode or 'the calibrated mode'} makes {size_px[0]}x{size_px[1]} px of "
-            f"{calibrated_px[0]}x{calibrated_px[1]} px where the pictures have "
-            f"{args.size[0]}x{args.size[1]} px: state how they are made by --crop or --bin",
-        )
     if not str(mode):
         raise WrongUse("--crop, --bin or --flip is expected: the calibrated mode needs no other file")
     if args.out.exists() and args.out.samefile(args.file):

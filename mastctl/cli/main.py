@@ -35,7 +35,7 @@ OVERVIEW: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "status": ("service", "show the state of a daemon, its operations or events"),
         "point": ("steering", "point a camera at something and measure the residual, or jog"),
         "track": ("steering requests", "follow a target while the rover moves"),
-        "panorama": ("panorama", "take a panorama, any pixel of which points the mast"),
+        "panorama": ("panorama requests", "take a panorama, any pixel of which points the mast"),
         "snapshot": ("service", "take a picture and write it to a file"),
         "record": ("record requests", "begin and end a recording; list, inspect, repair and replay them"),
         "stop": ("stop", "stop the mast at once; --without-daemon if that is dead"),

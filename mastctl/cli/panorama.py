@@ -217,18 +217,6 @@ def _keep(args: argparse.Namespace) -> Answer:
         return Answer({"targets": client.keep_target(args.name, position, frame, covariance)})
 
 
-@command(
-    "panorama forget",
-    option("NAME", "of the target", dest="name"),
-    *DAEMON,
-    help="forget a target",
-    example="outcrop",
-)
-def _forget(args: argparse.Namespace) -> Answer:
-    with client_of(args) as client:
-        return Answer({"targets": client.forget_target(args.name)})
-
-
 def _index(folder: Path) -> Index:
     from mastctl.panorama.folder import Folder
 

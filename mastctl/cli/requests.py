@@ -202,6 +202,13 @@ REQUESTS = (
         lambda client, _: client.track(),
         keys=TRACK,
     ),
+    Request(
+        "panorama forget",
+        "forget a target",
+        lambda client, args: {"targets": client.forget_target(args.name)},
+        (option("NAME", "of the target"),),
+        "outcrop",
+    ),
     Request("track stop", "end the track", lambda client, _: client.stop_track(), keys=TRACK),
 )  # fmt: skip
 

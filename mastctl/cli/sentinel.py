@@ -61,11 +61,10 @@ def _reference(args: argparse.Namespace) -> Answer:
         which, why = next(iter(taken.missing.items()))
         raise CommandError("no_picture", f"no reference was taken: {which}: {why}")
     saved = save_reference(args.folder, now_utc().isoformat(timespec="seconds"), rests, taken.pictures)
-    counts = f"{len(saved.pictures)} images at {len(rests)} poses"
     document = {
         "folder": str(args.folder), "pictures": len(saved.pictures), "rests": [list(rest) for rest in rests]
     }  # fmt: skip
-    return Answer(document, f"{args.folder}: {counts}, mast file {saved.mast_digest[:12]}")
+    return Answer(document)
 
 
 @command(

@@ -24,7 +24,7 @@ def test_a_mast_file_of_a_mode_is_written_and_says_so(
 ) -> None:
     new = tmp_path / "new.yaml"
     words = ["camera", "mode", str(mast), "--camera", "navcam_left", "--crop", "8", "4", "48", "40"]
-    words += ["--bin", "2", "--flip", "both", "--size", "24", "20", "--out", str(new), "--json"]
+    words += ["--bin", "2", "--flip", "both", "--out", str(new), "--json"]
     assert main(words) == 0
     told = json.loads(capsys.readouterr().out)
     stored = load_rig(new)
