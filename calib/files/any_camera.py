@@ -231,7 +231,8 @@ def nearest_lens(
             with np.errstate(all="ignore"):
                 if name == "cahvor":
                     twin = nearest_cahvor(model, limit_px)
-                    twin = twin if to == "cahvor" or _is_square(twin) else nearest_square(twin)
+                    off_rad = internal_parameters(twin)["Theta"] + np.pi / 2  # H and V's of a right angle
+                    twin = twin if to == "cahvor" or abs(off_rad) < 1e-12 else nearest_square(twin)
                 else:
                     twin = nearest_opencv(model, LENSES[name])
                 error = twin_error(model, twin)
@@ -246,11 +247,6 @@ def nearest_lens(
         raise ValueError(problem)
     at = plainest(tried, limit_px)
     return names[at], *tried[at]
-
-
-def _is_square(model: CameraModel) -> bool:
-    """Whether H and V are at right angles as far as numbers can say."""
-    return abs(internal_parameters(model)["Theta"] + np.pi / 2) < 1e-12
 
 
 def _why(model: CameraModel) -> str:

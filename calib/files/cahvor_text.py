@@ -71,7 +71,9 @@ def format_cahvor(model: CameraModel) -> bytes:
     comma, name = "", str(model.kind)
     if model.kind == "CAHVORE":
         name = f"CAHVORE{model.cahvore_type}"
-        comma = f",{_fixed(model.linearity)}" if model.cahvore_type == 3 else ""
+        # without exponent, which mrcal's pattern for the linearity does not know
+        linearity = np.format_float_positional(model.linearity, unique=True, trim="0")
+        comma = f",{linearity}" if model.cahvore_type == 3 else ""
     lines = [
         "# camera model in CAHVOR vectors, metres and pixels; the centre of the first pixel is (0, 0)",
         "",
@@ -184,8 +186,3 @@ def _numbers(values: Values, key: str, count: int, path: str | Path) -> list[flo
     if len(parts) != count:
         raise BadFile(path, f"line {line}", f"{key} has {len(parts)} numbers where {count} are expected")
     return [_number(part, path, line) for part in parts]
-
-
-def _fixed(value: float) -> str:
-    """Write a number without exponent (mrcal's pattern for the linearity knows none), nothing lost."""
-    return str(np.format_float_positional(value, unique=True, trim="0"))

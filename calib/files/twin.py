@@ -63,11 +63,8 @@ def as_kind(model: CameraModel, kind: Kind) -> CameraModel | None:
     if len(used) and used[-1] >= count:
         return None
     numbers = np.concatenate([model.distortion, np.zeros(14)])[:count]
-    return CameraModel.of_matrix(kind, model.size_px, _no_skew(model), numbers, model.rotation, model.C)
-
-
-def _no_skew(model: CameraModel) -> FloatArray:
-    return model.camera_matrix * [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]]
+    matrix = model.camera_matrix * [[1.0, 0.0, 1.0], [0.0, 1.0, 1.0], [0.0, 0.0, 1.0]]
+    return CameraModel.of_matrix(kind, model.size_px, matrix, numbers, model.rotation, model.C)
 
 
 @dataclass(frozen=True)
@@ -91,12 +88,9 @@ def error_sentence(error: TwinError) -> str:
     return f"{error.worst_px:.2g} px off at worst (at pixel {x:.0f}, {y:.0f}), {error.rms_px:.2g} px rms"
 
 
-def grid_px(size_px: tuple[int, int], counts: tuple[int, int], margin_px: float = 0.0) -> FloatArray:
-    """Return pixels (n, 2) in rows and columns over an image, the outer ones ``margin_px`` outside it."""
-    axes = [
-        np.linspace(-margin_px, size - 1.0 + margin_px, count)
-        for size, count in zip(size_px, counts, strict=True)
-    ]
+def grid_px(size_px: tuple[int, int], counts: tuple[int, int]) -> FloatArray:
+    """Return pixels (n, 2) in rows and columns over an image to its outer border."""
+    axes = [np.linspace(-0.5, size - 0.5, count) for size, count in zip(size_px, counts, strict=True)]
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
 
 
@@ -104,7 +98,7 @@ def twin_error(camera: CameraModel, twin: CameraModel) -> TwinError:
     """Return how far ``twin`` is from ``camera`` (of one size, in one frame), over the image to its outer
     border; if an entrance point moves, for points 1 m away too.
     """
-    pixels = grid_px(camera.size_px, (38, 31), 0.5)  # but for the corners none of those of a fit
+    pixels = grid_px(camera.size_px, (38, 31))  # but for the corners none of those of a fit
     far = np.zeros((2, len(pixels)))
     for off, one, other in zip(far, (camera, twin), (twin, camera), strict=True):
         rays = one.ray(pixels)
@@ -290,7 +284,7 @@ def _fit(
 
 def _points_of(camera: CameraModel) -> tuple[FloatArray, FloatArray]:
     """Pixels (n, 2) over the image and points (n, 3) seen there, near ones too where that matters."""
-    pixels = grid_px(camera.size_px, (25, 19), 0.5)
+    pixels = grid_px(camera.size_px, (25, 19))
     rays = camera.ray(pixels)
     if np.count_nonzero(rays.valid) < len(pixels) // 2:
         raise ValueError("more than half of the image has no ray that such a camera can have")

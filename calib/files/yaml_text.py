@@ -47,7 +47,9 @@ def parse_mapping(data: bytes, path: str | Path) -> dict[str, Any]:
             yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)), path
         ).document()
     except yaml.YAMLError as error:
-        raise BadFile(path, _line_of(error), f"is not YAML: {_problem_of(error)}") from None
+        mark = getattr(error, "problem_mark", None)
+        problem = getattr(error, "problem", None) or getattr(error, "reason", None) or "it cannot be parsed"
+        raise BadFile(path, f"line {mark.line + 1}" if mark else "", f"is not YAML: {problem}") from None
     if not isinstance(document, dict):
         raise BadFile(path, "", f"holds {kind_of(document)} where keys with values are expected")
     return document
@@ -133,15 +135,6 @@ def _scalar(event: Any, path: str | Path) -> Any:
 
 def _line(event: Any) -> str:
     return f"line {event.start_mark.line + 1}"
-
-
-def _line_of(error: yaml.YAMLError) -> str:
-    mark = getattr(error, "problem_mark", None)
-    return f"line {mark.line + 1}" if mark is not None else ""
-
-
-def _problem_of(error: yaml.YAMLError) -> str:
-    return str(getattr(error, "problem", None) or getattr(error, "reason", None) or "it cannot be parsed")
 
 
 class _Dumper(yaml.SafeDumper):

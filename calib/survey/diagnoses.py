@@ -196,12 +196,6 @@ def _dots_per_board(survey: Survey, dots: Dots) -> FloatArray | None:
     return np.asarray(np.linalg.lstsq(middle, dots.pixels_px - dots.pixels_px.mean(axis=0), rcond=None)[0].T)
 
 
-def pixels_per_metre(survey: Survey, dots: Dots) -> float | None:
-    """Return the scale of the grid along the direction in which it is not foreshortened, pixels per metre."""
-    spread = _dots_per_board(survey, dots)
-    return None if spread is None else float(np.linalg.norm(spread, 2))
-
-
 SIZE = 1.45
 """How much lens, lean and focal length may change the size of a board."""
 
@@ -286,10 +280,11 @@ def _camera_mixups(survey: Survey, camera: SurveyCamera, mine: list[BoardBearing
     seen, sizes = [], []
     for sight in mine:
         dots = survey.dots.get(sight.image.name)
-        scale = None if dots is None else pixels_per_metre(survey, dots)
-        if scale is not None:
+        spread = None if dots is None else _dots_per_board(survey, dots)
+        if spread is not None:
             seen.append(sight)
-            sizes.append(scale * sight.range_m / camera.focal_px)
+            # in px/m, along the direction in which the grid is not foreshortened
+            sizes.append(float(np.linalg.norm(spread, 2)) * sight.range_m / camera.focal_px)
     if len(seen) < 3:
         return
     aside = [sight.right_rad - (sight.image.pan_rad or 0.0) for sight in seen]

@@ -113,7 +113,8 @@ class _BoardRecord(Record, json_schema_extra={"dependentRequired": {"measured": 
         )
         if self.measured.down_m is not None:
             aspect *= _scale("down_m", self.measured.down_m, self.bar_m.down * scale, WORST_ASPECT)
-        return scaled(board, scale, aspect)
+        lengths = {key: scale * getattr(board, key) for key in vars(board) if key.endswith("_m")}
+        return replace(board, **lengths, aspect=aspect)
 
     @model_validator(mode="after")
     def _can_be_drawn(self) -> _BoardRecord:
@@ -281,9 +282,3 @@ def document_of(board: AnyBoard) -> dict[str, Any]:
 def board_of(path: str | Path, place: str, value: Any) -> AnyBoard:
     """Return the board that a mapping of a file holds. Raises BadFile as `load_board`."""
     return read_record(BoardRecord, value, path, place).root.board
-
-
-def scaled(board: AnyBoard, scale: float, aspect: float) -> AnyBoard:
-    """Return the board with every length times ``scale``, and another aspect."""
-    lengths = [key.name for key in fields(board) if key.name.endswith("_m")]
-    return replace(board, **{key: scale * getattr(board, key) for key in lengths}, aspect=aspect)

@@ -120,6 +120,11 @@ class Charuco(_Squares):
 
     kind: ClassVar[Literal["charuco"]] = "charuco"
 
+    @property
+    def first_is_white(self) -> bool:
+        """Whether the square in the upper left corner is white."""
+        return self.legacy and self.rows % 2 == 0
+
 
 @dataclass(frozen=True)
 class AprilGrid(_Grid):

@@ -380,11 +380,16 @@ def _complete(
     radius = board.dot_diameter_m / 2 / board.spacing_m
     contrast = float(np.median(contrasts(image, middles, found.shapes_px[lattice.spots])[0]))
     for _ in range(3):
-        plane_map = _consistent_map(places, middles)
+        points = places.astype(np.float64)
+        plane_map = fit_plane_map(points, middles)
+        if plane_map is not None:  # again, without spots that do not fit it
+            off = np.linalg.norm(plane_map.pixels(points) - middles, axis=-1)
+            good = off <= max(0.5, 4.0 * float(np.median(off)))
+            plane_map = fit_plane_map(points[good], middles[good])
         if plane_map is None:
             return CornersNotFound("spots that look like dots do not make a flat grid")
-        at = plane_map.pixels(places.astype(np.float64))
-        step = np.sqrt(np.abs(np.linalg.det(plane_map.jacobian(places.astype(np.float64)))))
+        at = plane_map.pixels(points)
+        step = np.sqrt(np.abs(np.linalg.det(plane_map.jacobian(points))))
         fits = np.linalg.norm(middles - at, axis=-1) < 0.15 * step
         places, middles = places[fits], middles[fits]
         more, at = _gaps(image, places, plane_map, radius, contrast)
@@ -392,17 +397,6 @@ def _complete(
             break
         places, middles = np.concatenate([places, more]), np.concatenate([middles, at])
     return _cut_out(image, places, middles, board)
-
-
-def _consistent_map(places: IntArray, middles: FloatArray) -> PlaneMap | None:
-    """The map from places to pixels, fitted again without spots that do not fit it."""
-    points = places.astype(np.float64)
-    plane_map = fit_plane_map(points, middles)
-    if plane_map is None:
-        return None
-    off = np.linalg.norm(plane_map.pixels(points) - middles, axis=-1)
-    good = off <= max(0.5, 4.0 * float(np.median(off)))
-    return plane_map if good.all() else fit_plane_map(points[good], middles[good])
 
 
 def _gaps(

@@ -137,7 +137,7 @@ def corners_on_board_m(board: MarkerBoard) -> FloatArray:
         half = -side / 2  # OpenCV's tags are upside down
     else:
         row, column = np.divmod(np.arange(board.rows * board.columns), board.columns)
-        white = (row + column) % 2 == int(not _white_first(board))
+        white = (row + column) % 2 == int(not board.first_is_white)
         row, column = row[white], column[white]
         middles = (
             np.stack([(column - (board.columns - 1) / 2), (row - (board.rows - 1) / 2)], axis=-1)
@@ -171,11 +171,6 @@ def placed_markers(markers: Markers, board: MarkerBoard) -> PlacedMarkers | None
     return PlacedMarkers(ids[keep], pixels[keep], metres[keep])
 
 
-def _white_first(board: Charuco) -> bool:
-    """Whether the square in the upper left corner is white."""
-    return board.legacy and board.rows % 2 == 0
-
-
 def chessboard_corners(board: Checkerboard, image: Grey8) -> MeasuredCorners | None:
     """Return the corners of a chessboard to a pixel; None if it is not seen whole.
 
@@ -194,19 +189,14 @@ def chessboard_corners(board: Checkerboard, image: Grey8) -> MeasuredCorners | N
     orders = [grid, grid[::-1, ::-1], grid[:, ::-1], grid[::-1]]
     if across == down:
         orders += [order.transpose(1, 0, 2) for order in orders]
-    orders = [order for order in orders if _handed(order) > 0]
+    # rows to the right and columns down, as in the image, not mirrored
+    orders = [one for one in orders if np.linalg.det([one[0, -1] - one[0, 0], one[-1, 0] - one[0, 0]]) > 0]
     dark = [_dark_first(image, order) for order in orders]
     # two orders may be right by colour; then the one whose rows run to the right
     likely = [order for order, first in zip(orders, dark, strict=True) if first] or orders
     upright = max(likely, key=lambda order: float((order[:, -1] - order[:, 0]).sum(axis=0)[0]))
     places = board.in_board_m(board.ids)[:, :2]
     return predicted(MeasuredCorners(places, upright.reshape(-1, 2)), board.ids, places)
-
-
-def _handed(grid: np.ndarray) -> float:
-    """Above 0 where rows to the right and columns down are so in the image, not mirrored."""
-    right, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-    return float(right[0] * down[1] - right[1] * down[0])
 
 
 def _dark_first(image: Grey8, grid: np.ndarray) -> bool:

@@ -82,8 +82,7 @@ def pattern_of(board: AnyBoard) -> Cells | Spots:
 def _squares(board: Charuco | Checkerboard) -> Cells:
     """Squares, and in the white ones of a ChArUco board its markers."""
     rows, columns = np.mgrid[: board.rows, : board.columns]
-    first_is_white = isinstance(board, Charuco) and board.legacy and board.rows % 2 == 0
-    black = (rows + columns) % 2 == int(first_is_white)
+    black = (rows + columns) % 2 == int(isinstance(board, Charuco) and board.first_is_white)
     width_m, height_m = board.size_m
     half = np.array([width_m, height_m / board.aspect]) / 2
     lines = [
