@@ -8,7 +8,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -87,24 +87,16 @@ class CameraControls:
         before every image that is taken after it, the end after the beginning, however late that is. So a
         camera that hangs or refuses keeps no operation waiting; its fault says so.
         """
-        context: list[AbstractContextManager[None]] = []
-        begun: list[bool] = []
+        stack = ExitStack()
 
         def enter() -> None:
-            begun.append(True)
             self._holds[name] += 1
-            one = self._cameras[name].exposure_held()
-            one.__enter__()
-            context.append(one)
-
-        def leave() -> None:
-            self._holds[name] -= len(begun)
-            if context:
-                context.pop().__exit__(None, None, None)
+            stack.callback(self._holds.subtract, [name])
+            stack.enter_context(self._cameras[name].exposure_held())
 
         def release() -> None:
             with suppress(DriverError):  # closed, and with it the camera
-                self._threads[name].submit("release_exposure", leave, HOLD_TIMEOUT_S, anyway=True)
+                self._threads[name].submit("release_exposure", stack.close, HOLD_TIMEOUT_S, anyway=True)
 
         try:
             self._threads[name].submit("hold_exposure", enter, HOLD_TIMEOUT_S)
@@ -432,35 +424,24 @@ class Cameras:
     def _check_as_calibrated(self, name: str) -> None:
         """Pass a camera whose sensor mode and size, as far as it knows them, are the mast file's.
 
-        Raises BadFrame if one is not, BadReply for an answer that is neither, and what its driver raises.
+        Raises BadFrame if one is not, and what its driver raises.
         """
-        calibrated = self._calibrated.get(name)
-        info = self._cameras[name].info
+        info, calibrated = self._cameras[name].info, self._calibrated.get(name)
+        mode, then = info.sensor_mode, None if calibrated is None else calibrated.sensor_mode
         # The mode first: its refusal says better than that of the size what would mend it.
-        self._check_mode(name, info.sensor_mode, calibrated)
+        if isinstance(mode, SensorMode):
+            self.sensor_modes[name] = mode
+            if then is not None:
+                frame_checks.check_mode(name, mode, then)
+                if mode.crop_px is None and then.crop_px is not None:
+                    log.warning(
+                        "%s: its driver does not report which part of its sensor is read; the crop "
+                        "is not compared with the mast file's",
+                        name,
+                    )
         if info.size_px is not None and calibrated is not None:
-            try:
-                width, height = (int(side) for side in info.size_px)
-            except (TypeError, ValueError, OverflowError):
-                message = f"info.size_px is {type(info.size_px).__name__} where (width, height) is expected"
-                raise BadReply(message, device=name) from None
+            width, height = map(int, info.size_px)
             frame_checks.check_size(name, (width, height), calibrated.model.size_px)
-
-    def _check_mode(self, name: str, mode: SensorMode | None, calibrated: RigCamera | None) -> None:
-        if mode is None:
-            return
-        if not isinstance(mode, SensorMode):
-            message = f"info.sensor_mode is {type(mode).__name__} where a SensorMode is expected"
-            raise BadReply(message, device=name)
-        self.sensor_modes[name] = mode
-        if calibrated is not None and (then := calibrated.sensor_mode) is not None:
-            frame_checks.check_mode(name, mode, then)
-            if mode.crop_px is None and then.crop_px is not None:
-                log.warning(
-                    "%s: its driver does not report which part of its sensor is read; the crop "
-                    "is not compared with the mast file's",
-                    name,
-                )
 
     def _pace_of(self, name: str) -> Pace | None:
         """What a camera states of its frames' times; None for one without a steady rate."""

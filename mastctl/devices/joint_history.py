@@ -20,6 +20,7 @@ import numpy as np
 from calib.geometry.rig import Approach, JointErrors, Pair
 from drivers.errors import BadReply
 from drivers.interfaces import Reading
+from mastctl.devices.frames import number
 from mastctl.errors import one_line
 
 KEPT_READINGS = 3000  # one minute at 50 Hz
@@ -55,13 +56,11 @@ def checked(answer: object, device: str, now_s: float, newest_s: float | None) -
     """
     numbers = {}
     for name in ("pan_rad", "tilt_rad", "time_s"):
-        value = getattr(answer, name, None)
-        if isinstance(value, (bool, str)) or not isinstance(value, (int, float, np.integer, np.floating)):
-            found = f"read returned {type(answer).__name__} whose {name} is {str(value)[:40]}"
-            raise BadReply(f"{found} where a number is expected", device=device)
-        numbers[name] = float(value)
-        if not math.isfinite(numbers[name]):
-            raise BadReply(f"{name} is {numbers[name]} where a finite number is expected", device=device)
+        try:
+            numbers[name] = number(getattr(answer, name, None))
+        except (TypeError, ValueError) as reason:
+            found = f"read returned {type(answer).__name__} whose {name} is {reason}"
+            raise BadReply(found, device=device) from None
     moving = getattr(answer, "moving", None)
     if not isinstance(moving, (bool, np.bool_)):
         raise BadReply(f"moving is {str(moving)[:40]} where true or false is expected", device=device)

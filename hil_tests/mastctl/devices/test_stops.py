@@ -17,7 +17,7 @@ from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from hil_tests.waiting import NET_S, until
 from mastctl.devices import devices as devices_module
 from mastctl.devices.devices import Devices
-from mastctl.devices.thread import next_try_s
+from mastctl.devices.thread import DeviceThread, next_try_s
 from mastctl.errors import MastctlError, Stopped
 
 DEADLINE_S = 1.0
@@ -287,3 +287,18 @@ def test_rest_after_a_move_of_before_the_stop_proves_nothing(
     hardware.head.hook = lambda name: None
     devices.move(0.3, 0.1)
     clock.until(lambda: devices.faults() == (), "the end of the fault")
+
+
+def test_a_call_given_up_at_its_deadline_is_overdue_for_the_next() -> None:
+    clock = Turned()
+    hang = Hang(clock)
+    with clock.at_work():
+        thread = DeviceThread("pan_tilt", clock=clock)
+        try:
+            with pytest.raises(NoReply, match="did not end within its deadline"):
+                thread.call("read", hang, 1.0)
+            with pytest.raises(NoReply, match=r"read has been under way for 1\.0 s"):
+                thread.submit("read", lambda: None, 1.0)
+        finally:
+            hang.let_go()
+    assert thread.close(60.0)
