@@ -1,4 +1,4 @@
-"""The cameras as the service uses them: one thread each, sets that belong together, with their facts."""
+"""The cameras as the service uses them: one thread each, settings, sets of frames that belong together."""
 
 from __future__ import annotations
 
@@ -27,6 +27,21 @@ from mastctl.devices.frames import KEPT_FRAMES, REQUESTED, FrameStore, StampedFr
 from mastctl.devices.joint_history import JointHistory
 from mastctl.devices.thread import Check, DeviceThread, ThreadCall
 from mastctl.errors import NoLonger, NotNow
+
+log = logging.getLogger(__name__)
+
+READINGS_S = 1.0  # for the head's readings to reach beyond an exposure
+SIZE_TIMEOUT_S = 1.0
+CAMERA_GRACE_S = 3.0  # beyond the time given to next_frame: copying and decoding on a busy machine
+WATCHED_SHARE = 0.1  # of real time that watched frames may keep a simulation's clock from going on
+NOT_COMPARED = "%s; the camera is used, and not compared with the mast file in this"
+MOVED_RAD = 1e-5  # a head camera's image that stays the same to the last bit beyond this is frozen
+FAULTS = {
+    "next_frame": "a picture comes",
+    "recent_times": "a pair of pictures comes",
+    "hold_exposure": "an operation can hold the exposure again",
+    "release_exposure": "an operation has held and released the exposure again",
+}
 
 HOLD_TIMEOUT_S = 3.0  # a driver waits up to 2 s for changes under way to show
 SET_TIMEOUT_S = 2.0
@@ -192,22 +207,6 @@ def check_wanted(
             raise BadSetting(message, device=camera)
         found[name] = min(max(value, one.minimum), one.maximum)
     return found
-
-
-log = logging.getLogger(__name__)
-
-READINGS_S = 1.0  # for the head's readings to reach beyond an exposure
-SIZE_TIMEOUT_S = 1.0
-CAMERA_GRACE_S = 3.0  # beyond the time given to next_frame: copying and decoding on a busy machine
-WATCHED_SHARE = 0.1  # of real time that watched frames may keep a simulation's clock from going on
-NOT_COMPARED = "%s; the camera is used, and not compared with the mast file in this"
-MOVED_RAD = 1e-5  # a head camera's image that stays the same to the last bit beyond this is frozen
-FAULTS = {
-    "next_frame": "a picture comes",
-    "recent_times": "a pair of pictures comes",
-    "hold_exposure": "an operation can hold the exposure again",
-    "release_exposure": "an operation has held and released the exposure again",
-}
 
 
 class Cameras:

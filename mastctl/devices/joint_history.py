@@ -32,6 +32,12 @@ MOST_FAULTS, LONGEST_FAULT = 20, 200  # what a head may report of itself at once
 STILL_RAD = 3e-3  # between neighbours; two counts of a 12-bit servo
 USUAL_PLAY_RAD = 6e-3  # of hobby servos' gears; it shows the side where the mast file states none
 
+DITHER_RAD = 5e-3  # from end to end: three counts of a 12-bit servo, 4.6 mrad
+DITHER_S = 1.0  # how long a dither is watched: a dozen readings in each half at the pace of a resting head
+SAME_RAD = 5e-4  # no change: below a count of any servo that counts on its output side
+TURNING = 7.0  # see RestWatch
+QUIET_SHARE = 0.25  # of the readings that must say rest; fewer is a head that says that it moves
+
 Interval = tuple[float, float]
 
 
@@ -226,13 +232,6 @@ def _taken_along(load: Interval | None, read_rad: float, play_rad: float) -> Int
 def _middles(loads: tuple[Interval, Interval]) -> Pair:
     pan, tilt = (0.5 * (low + high) for low, high in loads)
     return pan, tilt
-
-
-DITHER_RAD = 5e-3  # from end to end: three counts of a 12-bit servo, 4.6 mrad
-DITHER_S = 1.0  # how long a dither is watched: a dozen readings in each half at the pace of a resting head
-SAME_RAD = 5e-4  # no change: below a count of any servo that counts on its output side
-TURNING = 7.0  # see RestWatch
-QUIET_SHARE = 0.25  # of the readings that must say rest; fewer is a head that says that it moves
 
 
 def dithers(readings: Sequence[Reading], tolerance_rad: float = DITHER_RAD, for_s: float = DITHER_S) -> bool:

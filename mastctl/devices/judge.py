@@ -1,4 +1,4 @@
-"""The judge of moves: which may go out, with the limits and keep-outs of this moment.
+"""The limits, and the judge of moves: which may go out, with limits, keep-outs and sun of this moment.
 
 Where a head that moves may be is computed, not guessed. It is within the rectangle of the move that was let
 through last, which is free; and near its reading: as far off as it needs to brake from the fastest speed that
@@ -25,6 +25,20 @@ from mastctl.answers import SunTold
 from mastctl.control.machine import StandingFault
 from mastctl.devices.keep_out import Box, KeepOuts, Pair, Span
 from mastctl.errors import BadRequest
+
+log = logging.getLogger(__name__)
+
+REST_S = 0.3  # after a move was taken, before a reading that says rest is one of its end
+TRAVEL_S = 0.1  # from a reading to the moment when the next command acts on the axes
+ASSUMED_RAD_PER_S2 = 0.4  # of a head that does not say how it brakes: the least that a driver can be set to
+PARTS = 16  # in which a goal ahead is tried
+ROUNDED = 1.01  # a servo rounds its acceleration up to its own unit
+
+SUN = "sun"
+ROWS = 16  # over a cone's height: a row is an eighth of the half angle high
+LEAST_ROW_RAD = 0.004
+OVERLAP_RAD = 1e-6  # of rows: boxes are open, and two that only touch would leave a crack between them
+LEAST_CONE_RAD, WIDEST_CONE_RAD = 0.001, 1.5
 
 
 class OutsideLimits(BadRequest):
@@ -109,12 +123,6 @@ def _apart(value: float, bound: float) -> tuple[str, str]:
     return brief if brief[0] != brief[1] else (repr(value), repr(bound))
 
 
-SUN = "sun"
-ROWS = 16  # over a cone's height: a row is an eighth of the half angle high
-LEAST_ROW_RAD = 0.004
-OVERLAP_RAD = 1e-6  # of rows: boxes are open, and two that only touch would leave a crack between them
-LEAST_CONE_RAD, WIDEST_CONE_RAD = 0.001, 1.5
-
 Frame = Literal["rover", "site"]
 
 
@@ -189,15 +197,6 @@ def _joined(pans: list[Pair]) -> list[Pair]:
         else:
             joined.append((low, high))
     return joined
-
-
-log = logging.getLogger(__name__)
-
-REST_S = 0.3  # after a move was taken, before a reading that says rest is one of its end
-TRAVEL_S = 0.1  # from a reading to the moment when the next command acts on the axes
-ASSUMED_RAD_PER_S2 = 0.4  # of a head that does not say how it brakes: the least that a driver can be set to
-PARTS = 16  # in which a goal ahead is tried
-ROUNDED = 1.01  # a servo rounds its acceleration up to its own unit
 
 
 @dataclass(frozen=True)

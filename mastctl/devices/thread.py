@@ -34,6 +34,13 @@ LONGEST_MESSAGE, LONGEST_CODE = 400, 60  # of what a driver says went wrong
 CHECKED_S = 0.02  # how late a stop is noticed by a caller that waits
 AFTER_ERROR_S = 0.2  # before the device is tried again between calls
 
+PATIENCE_S = 0.05  # how long a stop waits for the head's own thread before it goes out beside it
+AT_ONCE_S = 0.002  # the same for a driver that is at its best beside a call under way
+LATEST_SHARE = 1 / 8  # of the time that a head hangs already: a new stop waits no longer for its own thread
+MAY_MOVE = "the head may still move"
+UNTIL = "a stop is confirmed, or a later move is taken and the head then rests"
+UNTIL_LINE = "the line is back and the head rests, or a stop is confirmed"
+
 
 @dataclass(eq=False)
 class ThreadCall(Generic[T]):
@@ -326,14 +333,6 @@ def _named(fault: DriverError, message: str, device: str) -> DriverError:
         named = DriverError(message, device=device)
         named.code = one_line(fault.code, LONGEST_CODE) or DriverError.code
         return named
-
-
-PATIENCE_S = 0.05  # how long a stop waits for the head's own thread before it goes out beside it
-AT_ONCE_S = 0.002  # the same for a driver that is at its best beside a call under way
-LATEST_SHARE = 1 / 8  # of the time that a head hangs already: a new stop waits no longer for its own thread
-MAY_MOVE = "the head may still move"
-UNTIL = "a stop is confirmed, or a later move is taken and the head then rests"
-UNTIL_LINE = "the line is back and the head rests, or a stop is confirmed"
 
 
 @dataclass(frozen=True)

@@ -49,6 +49,17 @@ UNKNOWN_PX = np.full(2, math.nan)
 BEFORE_TIMEOUT_S = 2.0
 """An image to compare with is worth waiting for some frames, not for a camera that is gone."""
 
+USUAL_RULES = HandoffRules()
+CENTRING_STEPS = 3
+"""Each solves exactly for one camera; the place in the other follows within a pixel after two."""
+
+JOINT_SIGMA_RAD = 3e-5
+"""What a joint reading is assumed to be wrong by: half a step of a stepped pan/tilt unit."""
+LEAST_SIGMA_PX = 0.05
+HANDOFF_SETTINGS = RefineSettings(least_px=6.0, model_px=1.0)
+"""Two sets of cameras may mean rover frames that are 5 mrad apart, the paper's bias of 2 px in a Hazcam: wide
+enough that this is found also by a mast file that says nothing of its own errors. Beyond 3 px nothing is."""
+
 
 class NotTrackable(MastctlError):
     """A track that cannot begin: sky, plain surface, edge, hidden from one camera, nothing at the place."""
@@ -303,11 +314,6 @@ def _pixel(
     }
 
 
-USUAL_RULES = HandoffRules()
-CENTRING_STEPS = 3
-"""Each solves exactly for one camera; the place in the other follows within a pixel after two."""
-
-
 @dataclass(frozen=True)
 class PairChoice:
     """A pair that sees a target.
@@ -434,14 +440,6 @@ def _check_in_image(camera: str, model: CameraModel, position_m: FloatArray, mar
             f"{camera} has it at pixel ({pixel[0]:.0f}, {pixel[1]:.0f}), not {margin_px:g} px inside its "
             f"{width}x{height} px"
         )
-
-
-JOINT_SIGMA_RAD = 3e-5
-"""What a joint reading is assumed to be wrong by: half a step of a stepped pan/tilt unit."""
-LEAST_SIGMA_PX = 0.05
-HANDOFF_SETTINGS = RefineSettings(least_px=6.0, model_px=1.0)
-"""Two sets of cameras may mean rover frames that are 5 mrad apart, the paper's bias of 2 px in a Hazcam: wide
-enough that this is found also by a mast file that says nothing of its own errors. Beyond 3 px nothing is."""
 
 
 def _record_of(
