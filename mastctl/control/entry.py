@@ -37,7 +37,6 @@ LONGEST_KEY = 200
 WAIT_S = 30.0  # for the first of two, longer than any command takes that is accepted or refused
 FOLLOWED = 256  # operations whose end is still recorded with the client that began them
 PUBLISHED = 256  # records that a new listener still gets
-PUBLISHED_OF_STRANGERS = 32  # beside them
 
 
 @dataclass(frozen=True)
@@ -235,8 +234,7 @@ class CommandEntry:
         self._answers = answers
         self._operations = operations
         self._publisher = publisher
-        # Keys, oldest first: of known clients, and of strangers.
-        self._published: tuple[deque[str], deque[str]] = deque(), deque()
+        self._published: deque[str] = deque()  # keys, oldest first
         self._numbers = itertools.count(1)
         self._matching = threading.Lock()
         self._began: dict[str, dict[str, Any]] = {}  # operation: the client that began it, until it has ended
@@ -375,14 +373,12 @@ class CommandEntry:
                 del known[next(iter(known))]
 
     def _write(self, line: dict[str, Any]) -> None:
-        stranger = line["via"] == NETWORK
-        (self.strangers if stranger else self.audit).put(line)
+        (self.strangers if line["via"] == NETWORK else self.audit).put(line)
         key = f"{line['number']}.end" if "ended" in line else f"{line['number']}"
         self._publisher.publish("command", key, line)
-        keys, most = self._published[stranger], PUBLISHED_OF_STRANGERS if stranger else PUBLISHED
-        keys.append(key)
-        while len(keys) > most:
-            self._publisher.forget("command", keys.popleft())
+        self._published.append(key)
+        while len(self._published) > PUBLISHED:
+            self._publisher.forget("command", self._published.popleft())
 
     def _now(self) -> dict[str, Any]:
         return {"time": datetime.now(UTC).isoformat(), "monotonic_s": self._clock.now_s()}

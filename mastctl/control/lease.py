@@ -113,7 +113,6 @@ class Lease:
 
     id: str
     holder: str
-    since_s: float
     for_s: float
     until_s: float
     last_stop: StopCame | None = None
@@ -379,9 +378,9 @@ class LeaseTable:
         raise LeaseOver(how)
 
     def _grant(self, caller: Caller, name: str | None, for_s: float, last_stop: StopCame | None) -> Lease:
-        now_s, key = self._clock.now_s(), secrets.token_hex(16)
-        times_s = now_s, for_s, now_s + for_s
-        lease = Lease(key, name or caller.name, *times_s, last_stop, caller.credential, caller.name)
+        until_s = self._clock.now_s() + for_s
+        holder, proof = name or caller.name, caller.credential
+        lease = Lease(secrets.token_hex(16), holder, for_s, until_s, last_stop, proof, caller.name)
         self._lease = lease
         return lease
 

@@ -15,7 +15,6 @@ from mastctl.control.entry import Answers
 from mastctl.errors import BadRequest, NotNow
 
 SAME = {"command": "point", "request": {"pan_rad": 0.1}}
-OTHER = {"command": "point", "request": {"pan_rad": 0.2}}
 
 
 class Acts:
@@ -40,22 +39,6 @@ def clock() -> ManualClock:
 @pytest.fixture
 def answers(clock: ManualClock) -> Answers:
     return Answers(clock)
-
-
-def test_the_second_gets_the_firsts_answer_and_nothing_is_done(answers: Answers) -> None:
-    acts = Acts()
-    assert answers.once("bench", "k", SAME, acts) == ({"id": 1}, False)
-    assert answers.once("bench", "k", SAME, acts) == ({"id": 1}, True)
-    assert acts.done == 1
-
-
-def test_one_key_for_two_requests_is_refused(answers: Answers) -> None:
-    acts = Acts()
-    answers.once("bench", "k", SAME, acts)
-    with pytest.raises(BadRequest) as refusal:
-        answers.once("bench", "k", OTHER, acts)
-    assert refusal.value.code == "key_reused"
-    assert acts.done == 1
 
 
 def test_anothers_key_is_another_key(answers: Answers) -> None:

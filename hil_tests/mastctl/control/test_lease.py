@@ -82,7 +82,7 @@ def test_the_holders_own_name_does_not_do_instead_of_its_lease(world: World) -> 
     lease = world.leases.acquire(BENCH)
     refused("leased", lambda: world.steer(BENCH))
     refused("leased", lambda: world.leases.acquire(BENCH))
-    refused("lease_unknown", lambda: world.steer(BENCH, Lease("0" * 32, "bench", 0, 1, 2)))
+    refused("lease_unknown", lambda: world.steer(BENCH, Lease("0" * 32, "bench", 1, 2)))
     world.steer(ROVER, lease)  # who has been given the id steers in the holder's name
 
 
