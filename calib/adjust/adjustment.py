@@ -6,9 +6,9 @@ so the prisms' places on the rover and the joint angles of every head attitude. 
 prisms and tapes (station), prisms from CAD and joint angles; each residual is divided by its sigma. The
 prisms' CAD positions define the rover frame.
 
-A bench has no station: its boards' poses are unknown, or one of them is fixed; the rover frame is the mast's
-own or hangs on what is fixed; and the joints' errors (``calib.geometry.rig``) and the boards' bows may be
-unknowns too. A prior of usual joints and boards holds such an unknown where pictures hardly show it.
+A bench has no station: its boards' poses are unknown, the mast is fixed, and the joints' errors
+(``calib.geometry.rig``) and the boards' bows may be unknowns too. A prior of usual joints and boards holds
+such an unknown where pictures hardly show it.
 
 A residual of the station is taken in the rover frame: turning it does not change its size, since the
 station's sigma is the same for each axis. Rigid unknowns move by a turn (3, a rotation vector

@@ -467,9 +467,8 @@ def _changes(fit: ScoredFit) -> Iterator[Hypothesis]:
         return board_moved(board, placement, found.before, found.after, by)
 
     for board in dict.fromkeys(image.board for image in fit.images):
-        if board not in fit.problem.fixed:
-            rows = fit.rows(lambda image, motions: motions.block.rates(("board", image.board)), board=board)
-            yield Hypothesis("board moved", ("board", *board), rows, sentence, "from")
+        rows = fit.rows(lambda image, motions: motions.block.rates(("board", image.board)), board=board)
+        yield Hypothesis("board moved", ("board", *board), rows, sentence, "from")
     if not fit.problem.upright:
         yield from _axes(fit)
     yield from _joints(fit, "slip")

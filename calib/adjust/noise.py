@@ -270,7 +270,7 @@ def print_error_m(problem: Adjustment, state: Estimate) -> float:
 
     It is the same in all pictures, where noise is another in each; 0 where chance makes them agree as much.
     """
-    shown = [t for t in problem.images if t.keep.any() and t.ids is not None and t.board not in problem.fixed]
+    shown = [t for t in problem.images if t.keep.any() and t.ids is not None]
     sums: dict[tuple[str, int], FloatArray] = {}
     for term, block in zip(shown, problem.blocks_of(state, shown), strict=True):
         axes = state.rover_from_board[term.board].rotation[:, :2]

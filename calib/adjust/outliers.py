@@ -255,7 +255,7 @@ def _culprit(problem: Adjustment, state: Estimate, suspect: int) -> int:
     """
     board = problem.images[suspect].board
     together = [i for i, t in enumerate(problem.images) if t.board == board and t.keep.any()]
-    if not 2 <= len(together) <= TELL_APART or board in problem.fixed:
+    if not 2 <= len(together) <= TELL_APART:
         return suspect
     tapes = [p for p in problem.station if p.board == board and p.keep]
     blocks = problem.blocks_of(state, [*(problem.images[i] for i in together), *tapes])

@@ -33,7 +33,7 @@ from calib.adjust.robust import (
 from calib.adjust.solver import minimise
 from calib.adjust.terms import ImageTerm
 from calib.adjust.unknowns import Estimate
-from calib.calibrate.starts.bench import BenchNotFitted, SomethingChanged, bench_start, best_cut
+from calib.calibrate.starts.bench import BenchNotFitted, BoardMoved, SomethingChanged, bench_start, best_cut
 from calib.calibrate.starts.views import ViewPoses, ViewsTooFew, view_poses
 from calib.geometry.rigid import Rigid
 from calib.geometry.significance import Level
@@ -51,17 +51,12 @@ SUREST = 0.1
 FEWEST_CORNERS = 6
 """An image with fewer takes no part: with four, a pose goes through them whatever they are."""
 
-KnownBoard = tuple[tuple[str, str], Rigid]
-"""A board and placement, and where it stands in the rover."""
 
-
-def fit_bench(
-    survey: Survey, *, rover_from_mast: Rigid | None = None, rover_from_board: KnownBoard | None = None
-) -> BenchCalibration:
+def fit_bench(survey: Survey, *, rover_from_mast: Rigid | None = None) -> BenchCalibration:
     """Fit a rig to a bench's pictures, every measurement weighted by its sigma; check images take no part.
 
-    The rover frame is where the mast's frame at zero angles was stated to be, as by a level and a tape, or
-    where a board's pose was; by default it is the mast's.
+    The rover frame is where the mast's frame at zero angles was stated to be, as by a level and a tape; by
+    default it is the mast's.
 
     Raises
     ------
@@ -71,7 +66,7 @@ def fit_bench(
     """
     began = time.perf_counter()
     try:
-        bench = BenchProblem(survey, rover_from_mast, rover_from_board)
+        bench = BenchProblem(survey, rover_from_mast)
         candidates = bench.candidates()
         problem, start = _without_changes(bench, candidates)
         bench.refuse_far(problem, start)  # where nothing fits, before blunders are searched for one by one
@@ -119,10 +114,8 @@ class BenchProblem:
     Raises BenchNotFitted if the pictures allow no start, or a board stood at two places.
     """
 
-    def __init__(
-        self, survey: Survey, rover_from_mast: Rigid | None = None, known: KnownBoard | None = None
-    ) -> None:
-        self.survey, self.known, self.rover_from_mast = survey, known, rover_from_mast
+    def __init__(self, survey: Survey, rover_from_mast: Rigid | None = None) -> None:
+        self.survey, self.rover_from_mast = survey, rover_from_mast
         self.notes = list[str]()
         images, checks, attitudes = bench_terms(survey, self.notes)
         if not any(t.attitude is not None for t in images):
@@ -141,26 +134,17 @@ class BenchProblem:
 
     def _in_rover(self, state: Estimate) -> Estimate:
         """The start, which is in the mast's frame, carried to where the rover frame was chosen to be."""
-        known, rover_from_mast = self.known, self.rover_from_mast
         state = replace(state, bows_m={b: np.zeros(2) for b, _ in state.rover_from_board})
-        if known is not None and known[0] not in state.rover_from_board:
-            shown = ", ".join("/".join(board) for board in state.rover_from_board)
-            raise BenchNotFitted(
-                f"no picture shows the board {'/'.join(known[0])} that is known; there are {shown}"
-            )
-        if known is not None:
-            rover_from_mast = known[1] @ state.rover_from_board[known[0]].inverse
-        if rover_from_mast is None:
+        carried = self.rover_from_mast
+        if carried is None:
             return state
-        angles = Rotation.from_matrix(rover_from_mast.rotation).as_euler("XYZ")
-        boards = {b: rover_from_mast @ pose for b, pose in state.rover_from_board.items()}
-        if known is not None:
-            boards[known[0]] = known[1]
+        angles = Rotation.from_matrix(carried.rotation).as_euler("XYZ")
         cameras = {
-            n: m.moved(rover_from_mast) if self.survey.cameras[n].on == "rover" else m
+            n: m.moved(carried) if self.survey.cameras[n].on == "rover" else m
             for n, m in state.cameras.items()
         }
-        mast = np.array([*rover_from_mast.translation_m, *angles, *state.mast[6:]])
+        mast = np.array([*carried.translation_m, *angles, *state.mast[6:]])
+        boards = {b: carried @ pose for b, pose in state.rover_from_board.items()}
         return replace(state, cameras=cameras, mast=mast, rover_from_board=boards)
 
     def problem(self, chosen: Mapping[str, ModelTerm], state: Estimate) -> Adjustment:
@@ -169,11 +153,10 @@ class BenchProblem:
             [replace(t, keep=t.keep & (t.name not in self.doubtful)) for t in self.images],
             (),
             state,
-            mast_parameters=[*(range(6) if self.known else ()), *term_numbers(chosen, "mast")],
+            mast_parameters=term_numbers(chosen, "mast"),
             joint_rad=self.survey.sigma.joint_rad,
             joint_errors=term_numbers(chosen, "joints"),
             bowed=[term.of for term in chosen.values() if term.kind == "bow"],
-            fixed=(self.known[0],) if self.known else (),
             huber=HUBER,
         )
 
@@ -227,10 +210,7 @@ def _gauges(bench: BenchProblem, chosen: Mapping[str, ModelTerm]) -> tuple[str, 
         "the rover frame is the mast's at zero angles (z down along the pan axis): where the vehicle is, "
         "pictures cannot show"
     )
-    if bench.known is not None:
-        board, placement = bench.known[0]
-        where = f"the rover frame hangs on placement {placement} of board {board}, whose pose was stated"
-    elif bench.rover_from_mast is not None:
+    if bench.rover_from_mast is not None:
         where = "the mast stands in the rover frame as was stated, with no uncertainty"
     sag = "the first harmonic of tilt is encoder and an arm's sag: pictures cannot separate them"
     return (where, *GAUGES, sag) if "tilt harmonic 1" in chosen else (where, *GAUGES)
@@ -303,7 +283,7 @@ def _views(survey: Survey, images: list[ImageTerm]) -> dict[str, ViewPoses]:
 def _without_changes(bench: BenchProblem, chosen: Mapping[str, ModelTerm]) -> tuple[Adjustment, Estimate]:
     """The problem with some terms, lone wrong corners left out, and its fit.
 
-    Raises BenchNotFitted if a board moved, and SomethingChanged if a joint slipped or a camera changed:
+    Raises BoardMoved if a board moved, and SomethingChanged if a joint slipped or a camera changed:
     nothing says which of its two states is the one to come.
     """
     problem = bench.problem(chosen, bench.start).without_unseen(bench.start)
@@ -319,7 +299,9 @@ def _without_changes(bench: BenchProblem, chosen: Mapping[str, ModelTerm]) -> tu
         change = find_change(scored)
         # The verdict names what drifts, with its size.
         if change is not None and not any(drift.likelier(change) for drift in find_drifts(scored)):
-            raise (BenchNotFitted if change.subject[0] == "board" else SomethingChanged)(change.sentence)
+            if change.subject[0] == "board":
+                raise BoardMoved(change.sentence, change.subject[2])
+            raise SomethingChanged(change.sentence)
     return problem.with_huber(HUBER), fit.state
 
 

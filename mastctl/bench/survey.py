@@ -19,7 +19,7 @@ import numpy as np
 
 from calib.adjust.result import BenchCalibration
 from calib.calibrate.bench import fit_bench
-from calib.calibrate.starts.bench import BenchNotFitted, SomethingChanged
+from calib.calibrate.starts.bench import BenchNotFitted, BoardMoved, SomethingChanged
 from calib.errors import BadFile
 from calib.files import replace_bytes
 from calib.files.mast_file import load_rig
@@ -252,22 +252,23 @@ def fit_in_frame(
     except SomethingChanged:
         raise
     except BenchNotFitted as reason:
-        rest = tuple(image for image in survey.images if image.placement not in (moved or {}))
-        if not moved or not rest:
+        moved = moved or {}
+        spoiled = {*moved, *([reason.placement] if isinstance(reason, BoardMoved) else ())}
+        rest = tuple(image for image in survey.images if image.placement not in spoiled)
+        if not spoiled or not rest:
             raise
         sentences = [
             f"the board or the head moved during placement {name} (its first picture taken again shows the "
             f"board {apart_px:.1f} px aside): its pictures are left out"
             for name, apart_px in moved.items()
         ]
+        sentences.append(f"with the pictures of placement {' and '.join(sorted(spoiled))}, {reason}")
         corners = {i.name: survey.corners[i.name] for i in rest if i.name in survey.corners}
         try:
             done = fitted(replace(survey, images=rest, corners=corners))
         except BenchNotFitted:
-            raise BenchNotFitted(
-                f"{'; '.join(sentences)}, and what is left is too little: {reason}"
-            ) from None
-        return replace(done, notes=(*done.notes, *sentences, f"with these, {reason}"))
+            raise BenchNotFitted(f"{'; '.join(sentences)}; what is left without them is too little") from None
+        return replace(done, notes=(*done.notes, *sentences))
 
 
 def without_lonely(survey: Survey) -> tuple[Survey, tuple[str, ...]]:

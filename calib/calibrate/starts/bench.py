@@ -56,6 +56,14 @@ class SomethingChanged(BenchNotFitted):
     not help, a person has to."""
 
 
+class BoardMoved(BenchNotFitted):
+    """A board moved during a ``placement``: the others may be good."""
+
+    def __init__(self, sentence: str, placement: str) -> None:
+        super().__init__(sentence)
+        self.placement = placement
+
+
 class BenchStart(NamedTuple):
     """The state to begin with, images that do not agree with it, and sentences for a person."""
 
@@ -135,7 +143,7 @@ def _refuse_two_places(shown: Sequence[ImageTerm], elsewhere: set[str]) -> None:
             f"other (pictures {', '.join(first)} and others). Two boards have the same ids, or it was "
             "moved and put back. Leave one board only, or print the other with other ids (first_id)"
         )
-    raise BenchNotFitted(board_moved(board, placement, shown[cut - 1].name, shown[cut].name))
+    raise BoardMoved(board_moved(board, placement, shown[cut - 1].name, shown[cut].name), placement)
 
 
 def best_cut(there: np.ndarray) -> tuple[int, int]:

@@ -24,7 +24,6 @@ from calib.calibrate.bench import BenchProblem, fit_bench
 from calib.calibrate.starts.bench import BenchNotFitted, BenchStart, SomethingChanged, bench_start
 from calib.calibrate.starts.views import view_poses
 from calib.geometry.rig import Mast
-from calib.geometry.rigid import Rigid
 from calib.geometry.significance import chance
 from hil_tests.support.sim_survey.bench import (
     NAVCAMS,
@@ -379,14 +378,3 @@ def test_too_few_pictures_say_what_is_missing() -> None:
     survey = simulate_bench(1, BenchPlan(attitudes=3, checks=0, placements=(Placement(1.5),)))
     with pytest.raises(BenchNotFitted, match="3 head positions where 4 at least"):
         fit_bench(survey)
-
-
-def test_a_board_at_a_known_place_carries_the_rover_frame() -> None:
-    plan = BenchPlan(attitudes=10)
-    rover_from_mast = Rigid(np.eye(3), np.array([0.3, 0.0, -1.4]))
-    known = rover_from_mast @ plan.placements[0].mast_from_board
-    fit = fit_bench(simulate_bench(3, plan), rover_from_board=(("b1", "p1"), known))
-    sigma = np.array(fit.sigma["mast"]["translation_m"])
-    assert (sigma > 0).all()
-    assert np.abs((fit.rig.mast.translation_m - rover_from_mast.translation_m) / sigma).max() < IN_SIGMAS
-    assert "placement p1 of board b1, whose pose was stated" in fit.gauges[0]

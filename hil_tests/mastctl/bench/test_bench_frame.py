@@ -12,7 +12,7 @@ import pytest
 
 from calib.adjust.result import BenchCalibration
 from calib.calibrate.bench import fit_bench
-from calib.calibrate.starts.bench import BenchNotFitted
+from calib.calibrate.starts.bench import BenchNotFitted, BoardMoved
 from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.rig import Mast, Rig
 from calib.survey.reader import read_survey
@@ -87,6 +87,16 @@ def test_a_placement_that_moved_is_left_out_with_a_sentence(
             raise BenchNotFitted("the fit leaves 24.6 times the stated noise of a corner")
         return whole(survey)
 
+    def finds_that_p1_moved(survey: Survey) -> BenchCalibration:
+        if any(image.placement == "p1" for image in survey.images):
+            raise BoardMoved("board b1 moved during placement p1, between pictures a and b", "p1")
+        return whole(survey)
+
+    monkeypatch.setattr(bench_survey, "fit_bench", finds_that_p1_moved)
+    done = fit_in_frame(survey, None, None)
+    assert {placement for _, placement in done.rover_from_board} == {"p2", "p3"}
+    (reason,) = [r for r in judge(survey, done).reasons if "placement p1" in r.sentence]
+    assert reason.grade == "care" and "moved during placement p1, between pictures a and b" in reason.sentence
     monkeypatch.setattr(bench_survey, "fit_bench", fits_only_without_p1)
     with pytest.raises(BenchNotFitted, match=r"24\.6 times"):
         fit_in_frame(survey, None, None)
