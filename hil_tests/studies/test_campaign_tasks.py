@@ -18,7 +18,7 @@ def run(repository: Path, *words: str) -> str:
     return "\n".join(line for line in done.stdout.splitlines() if "µs" not in line)
 
 
-@pytest.mark.long(2, "two processes; test_dask.py compares tasks with a cluster in the quick run")
+@pytest.mark.long(2, "two processes; test_tasks.py compares them with a cluster in the quick run")
 def test_a_campaign_prints_the_same_of_one_process_and_of_two(repository: Path) -> None:
     campaign = ("tools.campaigns.refine", "--rig", str(RIG_FILE), "--cases", "1", "--handoffs", "8")
     assert run(repository, *campaign, "--workers", "2") == run(repository, *campaign, "--workers", "1")

@@ -121,7 +121,7 @@ class RunFolder:
         """Return where a placement was requested; None if it was not, or a kill cut it short."""
         for note in self.notes:
             if note.get("event") == "placement" and note.get("name") == name:
-                at = note.get("requested") or note["asked"]
+                at = note["requested"]
                 return Placement(**{**at, "turned_deg": tuple(at["turned_deg"])})
         return None
 

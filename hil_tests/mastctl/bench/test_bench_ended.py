@@ -77,9 +77,9 @@ def test_whatever_ends_a_run_says_where_all_is_kept_and_what_goes_on(
     code: int,
     said: str,
 ) -> None:
-    exit_code, told = ended(monkeypatch, capsys, tmp_path, error)
-    assert exit_code == code and said in told
-    assert KEPT.format(folder=tmp_path / "m.bench") in told
+    exit_code, answer = ended(monkeypatch, capsys, tmp_path, error)
+    assert exit_code == code and said in answer
+    assert KEPT.format(folder=tmp_path / "m.bench") in answer
     assert not (tmp_path / "m.yaml").exists()
 
 
@@ -132,9 +132,9 @@ def _end_after(run: BenchRun, looks: int) -> None:
     """Have a run end after some looks that were kept."""
     take, left = run.known.take, looks
 
-    def taken(*told: Any, **options: Any) -> None:
+    def taken(*arguments: Any, **options: Any) -> None:
         nonlocal left
-        take(*told, **options)
+        take(*arguments, **options)
         left -= 1
         if not left:
             raise StopIteration
@@ -159,8 +159,8 @@ def test_a_search_that_finds_another_board_ends_soon_and_says_why(
     looked = bench.look
 
     def look(*at: Any) -> BenchLook:
-        told = "the board is not in the picture" if bench.looks == 1 else why
-        seen = tuple(replace(one, why=told) for one in looked(*at).seen)
+        answer = "the board is not in the picture" if bench.looks == 1 else why
+        seen = tuple(replace(one, why=answer) for one in looked(*at).seen)
         return BenchLook(seen, *at[:2])
 
     bench.look = look  # type: ignore[assignment, method-assign]

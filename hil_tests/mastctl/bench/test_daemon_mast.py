@@ -1,4 +1,4 @@
-"""A bench's mast on a whole daemon: what it is told when something is pulled out, dark, stopped or taken."""
+"""A bench's mast on a whole daemon: its sentences when something is pulled out, dark, stopped or taken."""
 
 from __future__ import annotations
 

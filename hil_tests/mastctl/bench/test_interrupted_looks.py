@@ -79,18 +79,18 @@ def far_look(url: str, act: Callable[[Client], object]) -> str:
     with Client(url, name="bench") as client, client.lease(name="calibrate bench"):
         mast = DaemonMast(client, ("navcam_left",), BOARD)
         thread = in_the_move(url, act)
-        with pytest.raises(BenchInterrupted) as told:
+        with pytest.raises(BenchInterrupted) as answer:
             mast.look(FAR_RAD, 0.0)
         thread.join()
-        return str(told.value)
+        return str(answer.value)
 
 
 def test_a_stop_and_an_emergency_stop_are_told_apart(url: str) -> None:
     assert far_look(url, lambda ana: ana.stop()) == (
         "the head was stopped in the middle of a move: a stop was requested"
     )
-    told = far_look(url, lambda ana: ana.estop(reason="a hand in the way", name="Ana"))
-    assert "an emergency stop" in told and "'mastctl reset' releases it" in told
+    answer = far_look(url, lambda ana: ana.estop(reason="a hand in the way", name="Ana"))
+    assert "an emergency stop" in answer and "'mastctl reset' releases it" in answer
     with Client(url) as client:
         client.reset(reason="the hand is away", name="Ana")
 

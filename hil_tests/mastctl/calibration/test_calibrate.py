@@ -14,9 +14,13 @@ import numpy as np
 import pytest
 
 from calib.files.mast_file import load_rig, save_rig
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.rig import Rig
 from calib.survey.reader import read_survey
 from hil_tests.mastctl.calibration.survey_world import edit_yaml, navcam_rig, navcam_survey, write_folder
 from hil_tests.support.sim_survey.board import draw_board, photograph
+from hil_tests.support.sim_survey.plan import SurveyPlan
+from hil_tests.support.sim_survey.survey import simulate_survey
 from mastctl.calibration.run import with_dots, without_dots
 from mastctl.cli.main import main
 
@@ -53,28 +57,28 @@ def test_json_has_the_contracts_keys_and_the_truth_within_its_sigmas(
     survey_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["calibrate", str(survey_folder), "--out", str(tmp_path / "m.yaml"), "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert set(told["rms_px"]) == set(told["check_rms_px"]) == {"navcam_left", "navcam_right"}
-    assert all(0.08 < value < 0.12 for pair in told["rms_px"].values() for value in pair)
+    answer = json.loads(capsys.readouterr().out)
+    assert set(answer["rms_px"]) == set(answer["check_rms_px"]) == {"navcam_left", "navcam_right"}
+    assert all(0.08 < value < 0.12 for pair in answer["rms_px"].values() for value in pair)
     true = navcam_rig().mast
     for key, values in (("translation_m", true.translation_m), ("rotation_rad", true.rotation_rad)):
-        error, sigma = np.array(told["mast"][key]) - values, np.array(told["sigma"][key])
+        error, sigma = np.array(answer["mast"][key]) - values, np.array(answer["sigma"][key])
         assert (np.abs(error) < SIGMAS * sigma).all(), (key, error, sigma)
-        assert told["sigma"]["mast"][key] == told["sigma"][key]
+        assert answer["sigma"]["mast"][key] == answer["sigma"][key]
         assert (sigma < 0.01).all()
-    assert told["mast"]["axis_offset_m"] == 0.0
-    assert told["seconds"] > 0
+    assert answer["mast"]["axis_offset_m"] == 0.0
+    assert answer["seconds"] > 0
     for joint in ("pan", "tilt"):
-        assert any(f"an offset of {joint} is no parameter" in words for words in told["held_fixed"])
-    assert told["verdict"]["grade"] == "good", told["verdict"]
-    kinds = {one["kind"]: one for one in told["sigmas_found"]}
+        assert any(f"an offset of {joint} is no parameter" in words for words in answer["held_fixed"])
+    assert answer["verdict"]["grade"] == "good", answer["verdict"]
+    kinds = {one["kind"]: one for one in answer["sigmas_found"]}
     assert set(kinds) == {"dots of navcam_left", "dots of navcam_right", "tapes", "prisms"}
     assert kinds["tapes"]["stated"] == 1.0 and kinds["tapes"]["unit"] == "mm"
     assert 0.8 < kinds["tapes"]["factor"] < 1.2
-    assert "mast" in {one["name"] for one in told["wider_models"]}
-    assert not any(one["significant"] for one in told["wider_models"])
-    assert told["cross_validation"] and not any(one["significant"] for one in told["cross_validation"])
-    assert load_rig(tmp_path / "m.yaml").digest == told["mast_file"]["digest"]
+    assert "mast" in {one["name"] for one in answer["wider_models"]}
+    assert not any(one["significant"] for one in answer["wider_models"])
+    assert answer["cross_validation"] and not any(one["significant"] for one in answer["cross_validation"])
+    assert load_rig(tmp_path / "m.yaml").digest == answer["mast_file"]["digest"]
 
 
 def test_the_mast_file_holds_fit_covariance_and_provenance(
@@ -102,11 +106,11 @@ def test_a_second_calibration_keeps_the_first_and_compares_with_it(
     old = save_rig(replace(true, mast=replace(true.mast, rotation_rad=np.zeros(3))), out)
     before = out.read_bytes()
     assert main(["calibrate", str(survey_folder), "--out", str(out), "--method", "paper", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    answer = json.loads(capsys.readouterr().out)
     assert (tmp_path / "m.previous.yaml").read_bytes() == before
-    assert told["method"] == "paper"
-    assert told["in_use"]["digest"] == old.digest
-    change = told["in_use"]["pointing_change"]["navcam"]
+    assert answer["method"] == "paper"
+    assert answer["in_use"]["digest"] == old.digest
+    change = answer["in_use"]["pointing_change"]["navcam"]
     # The old file's mast is off by 9 and 18 mrad: positions move by up to 26 px of a lens of 1290 px.
     assert 15.0 < change["position_most_px"] < 40.0
 
@@ -130,9 +134,55 @@ def test_a_mast_taken_as_upright_is_not_to_be_trusted(
 ) -> None:
     words = ["calibrate", str(survey_folder), "--out", str(tmp_path / "m.yaml"), "--method", "paper"]
     assert main([*words, "--mast", "4", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["verdict"]["grade"] == "bad"
-    assert any("--mast 6" in reason["sentence"] for reason in told["verdict"]["reasons"])
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["verdict"]["grade"] == "bad"
+    assert any("--mast 6" in reason["sentence"] for reason in answer["verdict"]["reasons"])
+
+
+# Only a rough focal length is known; one rig with all three kinds of camera
+
+
+def three_kinds(repository: Path) -> Rig:
+    """Navcams and Hazcams of the true rig, the left Navcam without a lens: CAHV, CAHVOR and CAHVORE."""
+    rig = load_rig(repository / "configs" / "sim" / "rocky8.yaml").rig
+    cameras = {name: camera for name, camera in rig.cameras.items() if not name.startswith("pancam")}
+    left = cameras["navcam_left"]
+    m = left.model
+    cameras["navcam_left"] = replace(left, model=CameraModel("CAHV", m.size_px, m.C, m.A, m.H, m.V))
+    return replace(rig, cameras=cameras, stereo={pair: rig.stereo[pair] for pair in ("navcam", "hazcam")})
+
+
+@pytest.mark.parametrize(
+    ("factor", "method"),
+    [(0.8, "joint"), (1.2, "paper")],
+)
+def test_cameras_of_every_kind_are_fitted_from_a_rough_focal_length_alone(
+    repository: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], factor: float, method: str
+) -> None:
+    true = three_kinds(repository)
+    write_folder(simulate_survey(true, 4, SurveyPlan(rough=False))[0], tmp_path / "s")
+
+    def rough(document: dict[str, Any]) -> None:
+        for name, camera in document["cameras"].items():
+            model = true.cameras[name].model
+            assert "rough" not in camera
+            camera["focal_px"] = str(factor * float(np.linalg.norm(np.cross(model.A, model.H))))
+
+    edit_yaml(tmp_path / "s", rough)
+    out = tmp_path / "m.yaml"
+    assert main(["calibrate", str(tmp_path / "s"), "--out", str(out), "--json", "--method", method]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["verdict"]["grade"] == "good", answer["verdict"]
+    fitted = load_rig(out).rig
+    kinds = {"navcam_left": "CAHV", "navcam_right": "CAHVOR", "hazcam_left": "CAHVORE"}
+    assert {name: fitted.cameras[name].model.kind for name in kinds} == kinds
+    for name, camera in fitted.cameras.items():
+        assert camera.model.R[0] == 0.0, "R0 is a gauge"
+        assert answer["sigma"]["cameras"][name].get("R", [0.0])[0] == 0.0
+        assert not any(p.startswith(f"cameras.{name}.R.0") for p in fitted.fit["parameters"])
+    for key in ("translation_m", "rotation_rad"):
+        error = np.array(answer["mast"][key]) - getattr(true.mast, key)
+        assert (np.abs(error) < SIGMAS * np.array(answer["sigma"][key])).all(), key
 
 
 # Refusals

@@ -99,7 +99,7 @@ def test_a_full_disk_leaves_everything_as_it_was(survey: Path, kept: Path, tmp_p
 def test_a_report_that_cannot_be_written_does_not_hide_the_mast_file(
     survey: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(*ignored: Any, **told: Any) -> str:
+    def full(*ignored: Any, **answer: Any) -> str:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(pages, "page", full)

@@ -71,9 +71,9 @@ def record(
 def refine(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict[str, Any]]:
     capsys.readouterr()
     code = main(["calibrate", *map(str, words), "--json"])
-    told = capsys.readouterr()
-    assert "Traceback" not in told.out + told.err
-    document: dict[str, Any] = json.loads(told.out, parse_constant=lambda word: pytest.fail(word))
+    answer = capsys.readouterr()
+    assert "Traceback" not in answer.out + answer.err
+    document: dict[str, Any] = json.loads(answer.out, parse_constant=lambda word: pytest.fail(word))
     return code, document
 
 
@@ -87,9 +87,9 @@ def test_a_significant_offset_gives_a_mast_file_that_says_its_origin(
     log, out = tmp_path / "h.jsonl", tmp_path / "new.yaml"
     record(mast, log)
     before = mast.read_bytes()
-    code, told = refine(capsys, mast, "--refine", log, "--out", out)
+    code, answer = refine(capsys, mast, "--refine", log, "--out", out)
     assert code == 0 and mast.read_bytes() == before
-    said = told["corrections"]["hazcam"]
+    said = answer["corrections"]["hazcam"]
     assert said["significant"] and said["significance_sigmas"] > 10 and said["handoffs"] == 24
     off = np.array(said["shift_m"] + said["turn_rad"]) - [*SHIFT_M, *TURN_RAD]
     assert off @ np.linalg.solve(np.array(said["covariance"]), off) < 22.5
@@ -97,7 +97,7 @@ def test_a_significant_offset_gives_a_mast_file_that_says_its_origin(
         assert np.hypot(*rms["before"]) > 1.2 > 0.9 > np.hypot(*rms["after"])
 
     old, new = load_rig(mast), load_rig(out)
-    assert told["mast_file"] == {"path": str(out), "digest": new.digest, "previous": None}
+    assert answer["mast_file"] == {"path": str(out), "digest": new.digest, "previous": None}
     for name in old.rig.cameras:
         same = (corrected(old.rig, name) == corrected(new.rig, name)).all()
         assert same == (name not in HAZCAMS)
@@ -121,9 +121,11 @@ def test_a_significant_offset_gives_a_mast_file_that_says_its_origin(
     )
 
     # The same record says nothing of the new file: it was made with the old one.
-    code, told = refine(capsys, out, "--refine", log, "--out", tmp_path / "again.yaml")
+    code, answer = refine(capsys, out, "--refine", log, "--out", tmp_path / "again.yaml")
     assert (
-        code == 1 and told["error"]["code"] == "too_few" and "another mast file" in told["error"]["message"]
+        code == 1
+        and answer["error"]["code"] == "too_few"
+        and "another mast file" in answer["error"]["message"]
     )
 
 
@@ -132,10 +134,12 @@ def test_without_an_offset_nothing_is_written_and_the_exit_code_is_one(
 ) -> None:
     log, out = tmp_path / "h.jsonl", tmp_path / "new.yaml"
     record(mast, log, moved=False)
-    code, told = refine(capsys, mast, "--refine", log, "--out", out)
+    code, answer = refine(capsys, mast, "--refine", log, "--out", out)
     assert code == 1 and not out.exists()
-    assert told["error"]["code"] == "not_significant" and "nothing was written" in told["error"]["message"]
-    assert told["error"]["detail"]["corrections"]["hazcam"]["significance_sigmas"] < 3
+    assert (
+        answer["error"]["code"] == "not_significant" and "nothing was written" in answer["error"]["message"]
+    )
+    assert answer["error"]["detail"]["corrections"]["hazcam"]["significance_sigmas"] < 3
 
 
 @pytest.mark.parametrize("which", ["mast", "record"])
@@ -146,8 +150,8 @@ def test_what_is_read_is_never_overwritten(
     record(mast, log)
     out = {"mast": mast, "record": log}[which]
     before = out.read_bytes()
-    code, told = refine(capsys, mast, "--refine", log, "--out", out)
-    assert code == 2 and told["error"]["code"] == "wrong_use" and out.read_bytes() == before
+    code, answer = refine(capsys, mast, "--refine", log, "--out", out)
+    assert code == 2 and answer["error"]["code"] == "wrong_use" and out.read_bytes() == before
 
 
 def test_bad_use_and_bad_files_end_with_two(
@@ -162,6 +166,6 @@ def test_bad_use_and_bad_files_end_with_two(
         (tmp_path, "--refine", log, "--out", out),
         (mast, "--refine", log, "--out", tmp_path / "no" / "new.yaml"),
     ):
-        code, told = refine(capsys, *words)
-        assert code == 2 and told["error"]["message"], words
+        code, answer = refine(capsys, *words)
+        assert code == 2 and answer["error"]["message"], words
     assert not out.exists()

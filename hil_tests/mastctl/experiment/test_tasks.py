@@ -1,4 +1,4 @@
-"""Tasks: their results in order, their errors named, and no process left behind."""
+"""Tasks: results in order, errors named, no process left behind; a Dask cluster comes to the same bits."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -13,8 +15,11 @@ import numpy as np
 import psutil
 import pytest
 
+from calib.files.mast_file import load_rig
+from hil_tests.mastctl.calibration.survey_world import RIG_FILE
 from hil_tests.mastctl.experiment.toy_tasks import Draw, broken_when_odd, drawn
-from mastctl.experiment.tasks import TaskFailed, run_tasks
+from mastctl.experiment.tasks import TaskFailed, open_executor, run_tasks
+from tools.campaigns import refine
 
 
 def test_results_come_in_the_order_of_the_tasks_not_of_their_ends() -> None:
@@ -39,6 +44,8 @@ def test_a_task_that_fails_is_named_with_its_error() -> None:
 
 LONG = """
 from mastctl.experiment.tasks import open_executor, run_tasks
+from calib.files.mast_file import load_rig
+from hil_tests.mastctl.calibration.survey_world import RIG_FILE
 from hil_tests.mastctl.experiment.toy_tasks import Draw, drawn_or_stuck
 
 if __name__ == "__main__":
@@ -59,3 +66,32 @@ def test_a_killed_run_leaves_no_process(tmp_path: Path) -> None:
         run.wait(60.0)
         gone, left = psutil.wait_procs(workers, timeout=60)
     assert gone and not left
+
+
+@pytest.fixture
+def address() -> Iterator[str]:
+    """The scheduler of a cluster of this machine: two workers in processes of their own."""
+    import dask  # slow to load, and every worker loads this file
+    from distributed import LocalCluster
+
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        dask.config.set(temporary_directory=folder),  # the scheduler's
+        LocalCluster(
+            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, host="127.0.0.1",
+            local_directory=folder,
+        ) as cluster,
+    ):  # fmt: skip
+        cluster.wait_for_workers(2, timeout=120)
+        yield str(cluster.scheduler_address)
+
+
+def test_a_campaign_on_a_cluster_comes_to_the_same_bits(address: str) -> None:
+    rig = load_rig(RIG_FILE).rig
+    blocks = [refine.RefineBlock(rig, (2.0, 2.0), 1.0, n, 1, 9, 0.2, 0.4, 1) for n in (0, 10)]
+    with open_executor("local", 2) as local, open_executor(f"dask:{address}") as cluster:
+        ours, theirs = (
+            [[vars(case) for case in block] for block in run_tasks(place, refine.run_block, blocks)]
+            for place in (local, cluster)
+        )
+    np.testing.assert_equal(theirs, ours)

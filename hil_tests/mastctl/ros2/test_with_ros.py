@@ -112,18 +112,18 @@ def test_a_program_of_ros_alone_sees_a_residual_and_stops_the_head(beside: Besid
     rests_s = time.time()
 
     def picture_at_rest() -> Any:
-        [(_, told)] = ros.fresh("navcam_left/image_raw/compressed", 60.0)
-        return told if seconds(told["header"]) > rests_s + 0.1 else None
+        [(_, answer)] = ros.fresh("navcam_left/image_raw/compressed", 60.0)
+        return answer if seconds(answer["header"]) > rests_s + 0.1 else None
 
     picture = until(picture_at_rest, "an image of the head at rest")
     rock = {"header": picture["header"], "point": {"x": ROCK_PX[0], "y": ROCK_PX[1], "z": 0.0}}
     ros.publish("point_at_pixel", POINT, rock)
-    [(_, told)] = ros.fresh("residual", 60.0)
+    [(_, answer)] = ros.fresh("residual", 60.0)
     [(_, sigma)] = ros.heard("residual_sigma", 1, 60.0)
     record = beside.ended(before)
-    assert [told["vector"]["x"], told["vector"]["y"]] == record["residual_px"]
+    assert [answer["vector"]["x"], answer["vector"]["y"]] == record["residual_px"]
     assert [sigma["vector"]["x"], sigma["vector"]["y"]] == record["residual_sigma_px"]
-    assert told["header"]["frame_id"] == "navcam_left_optical_frame"
+    assert answer["header"]["frame_id"] == "navcam_left_optical_frame"
     assert max(map(abs, record["residual_px"])) < 1.0
     assert record["request"]["pixel"]["frame_id"]
 
@@ -150,8 +150,10 @@ def test_stamps_are_the_daemons_own(beside: Beside) -> None:
         measured.add(event["value"]["measured_s"])  # type: ignore[call-overload, typeddict-item]
         if len(measured) >= 20:
             break
-    told = np.array([seconds(one["header"]) - offset_s for _, one in ros.heard("joint_states", 100, 60.0)])
-    off_s = [np.abs(told - one).min() for one in measured if told[0] + STAMP_S < one < told[-1] - STAMP_S]
+    answer = np.array([seconds(one["header"]) - offset_s for _, one in ros.heard("joint_states", 100, 60.0)])
+    off_s = [
+        np.abs(answer - one).min() for one in measured if answer[0] + STAMP_S < one < answer[-1] - STAMP_S
+    ]
     assert len(off_s) > 5
     assert max(off_s) < STAMP_S
     [(at_s, image)] = ros.fresh("navcam_left/image_raw/compressed", 60.0)
@@ -178,12 +180,12 @@ def test_a_point_of_a_frame_that_others_publish(beside: Beside) -> None:
     in_map = turn.apply(in_base) + place
     beside.rests()
     before = beside.newest_operation()["id"]
-    told = {"header": {"frame_id": "map"}, "point": dict(zip("xyz", in_map.tolist(), strict=True))}
-    ros.publish("point_at", POINT, told)
+    answer = {"header": {"frame_id": "map"}, "point": dict(zip("xyz", in_map.tolist(), strict=True))}
+    ros.publish("point_at", POINT, answer)
     record = beside.ended(before)
     assert record["state"] == "done"
     assert record["position_m"] == pytest.approx([6.0, -1.0, 0.1], abs=1e-9)
-    ros.publish("point_at", POINT, told | {"header": {"frame_id": "moon"}})
+    ros.publish("point_at", POINT, answer | {"header": {"frame_id": "moon"}})
     [(_, refused)] = ros.fresh("pointings", 60.0)
     assert refused["status"][0]["message"] == "tf does not know the frame 'moon'"
 
@@ -229,7 +231,7 @@ def test_camera_info_and_tf_are_those_of_the_mast_file(beside: Beside) -> None:
     beside.rests(0.5, -0.3)
     moving = ros.fresh("/tf", 60.0)[0][1]["transforms"]
     fixed = ros.heard("/tf_static", 0, 60.0)
-    parts = {one["child_frame_id"]: one for _, told in fixed for one in told["transforms"]} | {
+    parts = {one["child_frame_id"]: one for _, answer in fixed for one in answer["transforms"]} | {
         one["child_frame_id"]: one for one in moving
     }
     frame, found, place = "navcam_left_optical_frame", Rotation.identity(), np.zeros(3)
