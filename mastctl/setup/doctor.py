@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from pathlib import Path
 from shlex import quote
 from typing import Any
 
@@ -27,7 +26,6 @@ from mastctl.setup.machine import (
     examine_folder,
     examine_port,
 )
-from mastctl.watch.sentinel import SENTINEL_FOLDER, read_folder, standing
 
 
 def examine(
@@ -57,9 +55,8 @@ def examine(
     for name, camera in config.hardware.cameras.items():
         yield from examine_camera(name, camera, in_use=status is not None)
     yield from _simulation(config)
-    state_folder = config.state_folder or usual_folder(config.path, config.listen.url)
-    yield from examine_folder("state folder", state_folder)
-    yield from _sentinel(state_folder / SENTINEL_FOLDER)
+    folder = config.state_folder or usual_folder(config.path, config.listen.url)
+    yield from examine_folder("state folder", folder)
     yield examine_clock()
 
 
@@ -71,20 +68,6 @@ def next_command(config: str | None, found: Sequence[DoctorFinding]) -> str:
         return f"{bad.advice or bad.sentence}; then mastctl rig doctor{named}"
     runs = any(one.what == "daemon" and one.sentence.startswith("one runs") for one in found)
     return f"mastctl point{named} --angles 0.2 0.0" if runs else f"mastctl run{named}"
-
-
-def _sentinel(folder: Path) -> Iterator[DoctorFinding]:
-    """The drift sentinel's verdict, where it keeps its measurements in the state folder."""
-    reference, measurements, wrong = read_folder(folder)
-    if wrong:
-        yield DoctorFinding("drift", "unsure", wrong, "take a new reference: mastctl rig sentinel reference")
-    if reference is None:
-        return
-    now = standing(reference, measurements, datetime.now(UTC))
-    good = now["level"] == "good"
-    advice = "" if good else "repeat mastctl rig sentinel look; if it stays, calibrate again"
-    level: Level = "good" if good else "unsure"  # the daemon works all the same
-    yield DoctorFinding("drift", level, now["sentence"], advice)
 
 
 def _daemon(config: Config, status: Mapping[str, Any] | None) -> Iterator[DoctorFinding]:

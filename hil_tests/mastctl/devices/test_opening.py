@@ -122,6 +122,7 @@ STILL_RAD = 1e-3
 OPENING = {
     "rig servo set-id": ["PORT", "1", "7", "--torque-off"],
     "rig ptu home": ["PORT", "--sweep-full-range"],
+    "camera check": [CAMERA, "--seconds", "0.3", "--config", "CONFIG"],
     "camera sync": ["--seconds", "3", "--config", "CONFIG"],
     "rig sentinel reference": ["--folder", "sentinel", "--config", "CONFIG"],
 }
