@@ -234,24 +234,13 @@ def read_survey(folder: str | Path) -> Survey:
     )
 
 
-class Once:
-    """Refuses what is in a table a second time."""
-
-    def __init__(self) -> None:
-        self._places: dict[tuple[object, ...], str] = {}
-
-    def __call__(self, row: TableRow, what: str, *key: object) -> None:
-        if key in self._places:
-            raise row.bad("", f"{what} is there twice, first on {self._places[key]}")
-        self._places[key] = row.place
-
-
 class SurveyFolder:
-    """One reading of a folder; remembers what it read for the digest."""
+    """One reading of a folder; remembers what it read for the digest, and what may be there only once."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self._digests: dict[str, str] = {}
+        self._places: dict[tuple[object, ...], str] = {}
 
     def document(self) -> bytes:
         """Return the bytes of survey.yaml."""
@@ -293,6 +282,12 @@ class SurveyFolder:
         if required and not line:
             raise BadFile(path, "", f"has a header and no rows; one for each of {required} is expected")
 
+    def once(self, row: TableRow, what: str, *key: object) -> None:
+        """Refuse what is in a row's table a second time."""
+        place = self._places.setdefault((row.path, *key), row.place)
+        if place != row.place:
+            raise row.bad("", f"{what} is there twice, first on {place}")
+
     def check_picture(self, row: TableRow, file: str, camera: SurveyCamera) -> None:
         """Refuse a picture of another size, and note its content; one that is missing is for the check."""
         from calib.files.pictures import picture_size_px  # OpenCV, which numbers do without
@@ -319,7 +314,6 @@ class SurveyFolder:
 
 def _station(read: SurveyFolder, board: Board, prisms: Mapping[str, FloatArray]) -> tuple[StationPoint, ...]:
     points: list[StationPoint] = []
-    once = Once()
     known = {"prism": tuple(prisms), "tape": tuple(board.tapes_in_board_m)}
     of_what = "the prisms and tapes that were measured"
     for line, row in read.rows("station.csv", STATION_COLUMNS, required=of_what):
@@ -332,7 +326,7 @@ def _station(read: SurveyFolder, board: Board, prisms: Mapping[str, FloatArray])
         if kind in known:
             row.choice("point", known[kind], f"{kind} of survey.yaml")
         where = f"placement {placement} in " if placement else ""
-        once(row, f"{kind} {point} of {where}set-up {setup}", setup, kind, placement, point)
+        read.once(row, f"{kind} {point} of {where}set-up {setup}", setup, kind, placement, point)
         position_m = frozen_array([row.number(column, FURTHEST_M) for column in ("x_m", "y_m", "z_m")], (3,))
         points.append(StationPoint(setup, cast(StationKind, kind), placement, point, position_m, line))
     return tuple(points)
@@ -345,14 +339,13 @@ def _images(
     setups: list[str],
 ) -> tuple[SurveyImage, ...]:
     images: list[SurveyImage] = []
-    once, shown = Once(), Once()
     if boards:
         rows = read.rows("images.csv", BENCH_IMAGE_COLUMNS, ("setup", *APPROACH_COLUMNS))
     else:
         rows = read.rows("images.csv", IMAGE_COLUMNS, required="the images that were taken")
     for line, row in rows:
         name = row.text("image")
-        once(row, f"image {name}", name)
+        read.once(row, f"image {name}", name)
         camera = cameras[row.choice("camera", tuple(cameras), "camera of survey.yaml")]
         if boards:
             setup = row.cells.get("setup", "")
@@ -365,7 +358,7 @@ def _images(
         pan_rad, tilt_rad = (_joint_rad(row, column, camera) for column in ("pan_rad", "tilt_rad"))
         file = row.cells["file"]
         if file:
-            shown(row, f"board {board} in file {file}" if board else f"file {file}", file, board)
+            read.once(row, f"board {board} in file {file}" if board else f"file {file}", "file", file, board)
             read.check_picture(row, file, camera)
         images.append(
             SurveyImage(
@@ -435,7 +428,6 @@ def _corners(
     corner_px: float,
 ) -> dict[str, Corners]:
     found: dict[str, list[tuple[float, ...]]] = {}
-    once = Once()
     counts = {name: len(board.ids) for name, board in boards.items()}
     for _, row in read.rows("corners.csv", CORNER_COLUMNS, (SIGMA_COLUMN,)):
         image = _image(row, images)
@@ -443,7 +435,7 @@ def _corners(
         if board != image.board:
             raise row.bad("board", f"'{board}' where image {image.name} of images.csv shows {image.board}")
         number = row.index("id", counts[board])
-        once(row, f"corner {number} of image {image.name}", image.name, number)
+        read.once(row, f"corner {number} of image {image.name}", image.name, number)
         pixel, sigma_px = _pixel(row, cameras[image.camera]), corner_px
         if row.cells.get(SIGMA_COLUMN):
             sigma_px = row.number(SIGMA_COLUMN, 100.0)
@@ -458,11 +450,10 @@ def _dots(
     read: SurveyFolder, board: Board, cameras: Mapping[str, SurveyCamera], images: Mapping[str, SurveyImage]
 ) -> dict[str, Dots]:
     found: dict[str, list[tuple[float, ...]]] = {}
-    once = Once()
     for _, row in read.rows("dots.csv", DOT_COLUMNS):
         image = _image(row, images)
         place = row.index("row", board.rows), row.index("column", board.columns)
-        once(row, f"dot {place} of image {image.name}", image.name, place)
+        read.once(row, f"dot {place} of image {image.name}", image.name, place)
         found.setdefault(image.name, []).append((*place, *_pixel(row, cameras[image.camera])))
     tables = {name: np.array(rows) for name, rows in found.items()}
     indices = {name: t[:, :2].astype(np.int64) for name, t in tables.items()}
@@ -477,13 +468,12 @@ def _clicks(
 ) -> tuple[Click, ...]:
     checks = {(point.setup, point.point) for point in station if point.kind == "check"}
     clicks: list[Click] = []
-    once = Once()
     for _, row in read.rows("clicks.csv", CLICK_COLUMNS):
         image, point = _image(row, images), row.text("point")
         if (image.setup, point) not in checks:
             known = sorted(other for where, other in checks if where == image.setup)
             there = nearest(point, known) if known else "it has none"
             raise row.bad("point", f"'{point[:40]}' is no check point of set-up {image.setup}; {there}")
-        once(row, f"point {point} of image {image.name}", image.name, point)
+        read.once(row, f"point {point} of image {image.name}", image.name, point)
         clicks.append(Click(image.name, point, frozen_array(_pixel(row, cameras[image.camera]), (2,))))
     return tuple(clicks)

@@ -231,6 +231,7 @@ def _fitted(
     if isinstance(board, Charuco):
         inset_m = (board.square_m - board.marker_m) / 2 * np.array([1.0, board.aspect])
     printed = Crossings(pattern, board.ids, places, inset_m)
+    step_m = 1.3 * max(float(np.diff(line).max()) for line in board.lines_m)  # to a corner's neighbours
     found, tried = NO_SADDLES, np.zeros(len(places), dtype=bool)
     while len(start.ids):
         tried[start.ids] = True
@@ -240,8 +241,9 @@ def _fitted(
         found = found.some(_good(found))
         if len(found.ids) < FEWEST or tried.all():
             break
-        known = MeasuredCorners(places[found.ids], found.pixels_px)
-        ids = known.next_to(board.ids[~tried], places, board.lines_m)
+        known, ids = MeasuredCorners(places[found.ids], found.pixels_px), board.ids[~tried]
+        away_m = np.linalg.norm(places[ids][:, None] - known.points_m[None], axis=-1).min(axis=1)
+        ids = ids[away_m < step_m]
         tried[ids] = True
         # less where the corners found lie too badly to say where the next one is
         start = predicted(known, ids, places[ids])

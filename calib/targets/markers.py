@@ -31,14 +31,6 @@ class MeasuredCorners:
     ids: IntArray = field(default_factory=lambda: np.empty(0, np.int64))
     jacobians: FloatArray = field(default_factory=lambda: np.empty((0, 2, 2)))
 
-    def next_to(
-        self, ids: IntArray, places_m: FloatArray, lines_m: tuple[FloatArray, FloatArray]
-    ) -> IntArray:
-        """Return those of ``ids`` (their places on the board by id) that lie next to a known point."""
-        step_m = 1.3 * max(float(np.diff(line).max()) for line in lines_m)
-        away = np.linalg.norm(places_m[ids][:, None] - self.points_m[None], axis=-1).min(axis=1)
-        return np.asarray(ids[away < step_m])
-
 
 def predicted(known: MeasuredCorners, ids: IntArray, places_m: FloatArray) -> MeasuredCorners:
     """Return corners where the known points nearest to each say that they are.
