@@ -224,7 +224,7 @@ NO_REQUEST: dict[str, Callable[[], object]] = {
         frame="board",  # type: ignore[arg-type]
     ),
     "valid number": lambda: PointRequest(pan_rad=True, tilt_rad=0.0),
-    "goes with pixel only": lambda: PointRequest(position_m=[4.0, 0.0, 0.0], pointings=2),
+    "goes with a pixel only": lambda: PointRequest(position_m=[4.0, 0.0, 0.0], pointings=2),
     "not with joint angles": lambda: PointRequest(pan_rad=0.0, tilt_rad=0.0, aim=Aim("navcam_left", 1, 1)),
     "less than or equal to 2": lambda: PointRequest(pan_rad=0.0, tilt_rad=0.0, pointings=3),
 }

@@ -122,14 +122,14 @@ def test_the_request_reaches_the_loop_as_it_was_made(
 
 P = {"camera": "navcam_left", "frame_id": "f", "x_px": 1.0, "y_px": 2.0}
 BAD_POINTS: list[tuple[Any, str]] = [
-    ({}, "0 targets where exactly one of pixel, position_m, pan_rad with tilt_rad is expected"),
+    ({}, "0 targets where exactly one of pixel, panorama, position_m, pan_rad with tilt_rad is expected"),
     ({"pixle": P}, "pixle: unknown key; the nearest known is 'pixel'"),
     ({"pixel": {"camera": "navcam_left", "x_px": 1, "y_px": 2}}, "pixel.frame_id: the key is missing"),
     ({"pixel": {**P, "x_px": "12"}}, "pixel.x_px: the text '12' where a number is expected"),
     ({"position_m": [1, 2]}, "position_m: a list of 2 where a list of 3 numbers is expected"),
     ({**ANGLES, "frame": "rover"}, "frame goes with position_m only"),
     ({**ANGLES, "aim": {"camera": "navcam_left", "x_px": 1, "y_px": 1}}, "aim goes with pixel or position_m"),
-    ({**ANGLES, "pointings": 2}, "pointings is 2, which goes with pixel only"),
+    ({**ANGLES, "pointings": 2}, "pointings is 2, which goes with a pixel only"),
     ([], "the body: a list of 0 where a mapping with deadline_s, "),
     (None, "the request has no body where a JSON object is expected"),
 ]
