@@ -62,6 +62,18 @@ class PanoramaList(TypedDict):
     panoramas: list[PanoramaListed]
 
 
+class PanoramaDrawn(TypedDict):
+    """``GET /panoramas/{id}/drawing``: what is drawn over a panorama, in its pixels.
+
+    ``view_px``: the border of what the mosaic's camera sees now, null before the first reading of the head.
+    Before the mosaic is composed the pixels are those of a canvas to which ``/picture`` is stretched.
+    """
+
+    size_px: Annotated[list[int], Len(2, 2)]
+    view_px: list[Pixel] | None
+    targets_px: dict[str, Pixel]
+
+
 class KeptTarget(TypedDict):
     """A point kept by a name, in the site frame where a pose was known; its covariance where one is."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,10 +11,12 @@ import cv2
 import numpy as np
 
 from calib.errors import BadFile
-from calib.geometry.mosaic import Canvas, MosaicSurface, Projection, canvas_of
+from calib.geometry.cahvor import CameraModel
+from calib.geometry.mosaic import Canvas, MosaicSurface, Projection, border, canvas_of
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
 from calib.matching.mosaic import Picture, SeamError, Slip, composed, frames_of, gains_of, seams_of, slip_of
+from mastctl.answers import PanoramaDrawn
 from mastctl.as_json import as_json
 from mastctl.errors import BadRequest
 from mastctl.panorama.folder import (
@@ -40,6 +43,9 @@ class Composition:
     surface: MosaicSurface = GROUND
     px_per_rad: float | None = None
     raw: bool = False
+
+
+SO_FAR = Composition(px_per_rad=300.0)
 
 
 def canvas_for(folder: Folder, wanted: Composition, rig: Rig | None = None) -> Canvas:
@@ -87,8 +93,7 @@ def compose(folder: Folder, wanted: Composition, rig: Rig | None = None) -> Pict
 
 def so_far(folder: Folder) -> bytes:
     """Return what was taken so far as a JPEG of a preview's size, composed for the default surface."""
-    cameras = folder.cameras()
-    canvas = canvas_for(folder, Composition(px_per_rad=300.0))
+    cameras, canvas = folder.cameras(), canvas_for(folder, SO_FAR)
     owners, places = frames_of(canvas, cameras)
     picture = reduced(composed(folder.pictures(), owners, places))
     return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 85])[1])
@@ -148,6 +153,27 @@ def _slip(slip: Slip, numbers: list[int]) -> SlipRecord:
         axis=slip.axis, from_view=view, size_rad=slip.size_rad, sigma_rad=slip.sigma_rad,
         sentence=f"{slip.axis} truly stood {size} beside its reading {where}",
     )  # fmt: skip
+
+
+def drawn(folder: Folder, now: CameraModel | None, points_m: Mapping[str, FloatArray]) -> PanoramaDrawn:
+    """Return where a panorama has the border of a camera and some points (3,), both in the rover frame.
+
+    A point lies where the view shows it that has it nearest its middle. Raises CalibError.
+    """
+    record = folder.index.mosaic if folder.index.state == "done" else None
+    canvas, view = canvas_for(folder, SO_FAR) if record is None else record.canvas, None
+    if now is not None:
+        pixels = canvas.of_camera(now, np.vstack([border(now), now.image_center_px]))
+        turn = 2.0 * math.pi * canvas.px_per_rad  # in one piece about its middle:
+        pixels[:, 0] -= turn * np.round((pixels[:, 0] - pixels[-1, 0]) / turn)
+        view = np.round(pixels[:-1][np.isfinite(pixels[:-1]).all(axis=1)], 1).tolist()
+    targets: dict[str, list[float]] = {}
+    for name, point in points_m.items():
+        seen = [(one, place) for one in folder.cameras() if one.holds(place := one.project(point)[0])]
+        if seen:
+            camera, place = min(seen, key=lambda one: float(np.linalg.norm(one[1] - one[0].image_center_px)))
+            targets[name] = canvas.of_camera(camera, place).tolist()
+    return {"size_px": list(canvas.size_px), "view_px": view, "targets_px": targets}
 
 
 def degrees_of(px_per_rad: float) -> float:

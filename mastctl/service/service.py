@@ -19,6 +19,7 @@ import numpy as np
 
 from calib.errors import BadFile
 from calib.files.mast_file import StoredRig
+from calib.geometry.rigid import FloatArray
 from calib.matching.handoff import MatchedHandoff
 from drivers.clock import Clock, SystemClock
 from drivers.errors import BadOptions
@@ -29,6 +30,7 @@ from mastctl.answers import (
     CameraTold,
     KeptTarget,
     MeasuredJoints,
+    PanoramaDrawn,
     ReloadResult,
     Status,
     TrackTold,
@@ -47,11 +49,12 @@ from mastctl.devices.frames import OPERATIONS, StampedFrame, check_known, random
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.judge import OutsideLimits
 from mastctl.devices.opening import open_rig
-from mastctl.errors import BadRequest, MastctlError
+from mastctl.errors import BadRequest, MastctlError, NotNow
 from mastctl.motion.jog import Jogs
 from mastctl.motion.requests import wrong_camera
 from mastctl.motion.search import in_picture
 from mastctl.motion.track import ACTIVE, RoverPose, Tracker, TrackStatus
+from mastctl.panorama.compose import drawn
 from mastctl.panorama.panoramas import Panoramas
 from mastctl.recorder.entries import AttachedMast
 from mastctl.recorder.recorder import Recorder
@@ -327,8 +330,29 @@ class Service:
         """Return where a frame shows the kept targets, by name, as `track_in` has one."""
         if frame.mast_digest != self.stored.digest:
             return {}
-        camera, pose = self.stored.rig.camera_in_rover(frame.camera, *frame.true_rad), self.tracker.pose
+        camera = self.stored.rig.camera_in_rover(frame.camera, *frame.true_rad)
         shown: dict[str, dict[str, float]] = {}
+        for name, position, covariance in self._targets_in_rover():
+            if (place := in_picture(camera, position, covariance)) is not None:
+                shown[name] = place
+        return shown
+
+    def panorama_drawn(self, name: str) -> PanoramaDrawn:
+        """Return what is drawn over a panorama; targets only while the rover stands where it was taken.
+
+        Raises NotKnown ``panorama_unknown``, Unable ``unreadable``, NotNow ``no_views``.
+        """
+        folder, reading, moved_s = self.panoramas.open(name), self.devices.last_reading, self.tracker.moved_s
+        camera, rig = folder.index.cameras[0], self.stored.rig
+        if not (views := folder.index.taken()):
+            raise NotNow("no_views", f"panorama {name} has no view yet")
+        now = rig.camera_in_rover(camera, *reading.true_rad) if reading and camera in rig.cameras else None
+        stands = moved_s is None or moved_s < views[0][1].frames[camera].mid_exposure_s
+        return drawn(folder, now, {k: at for k, at, _ in self._targets_in_rover()} if stands else {})
+
+    def _targets_in_rover(self) -> Iterator[tuple[str, FloatArray, Any]]:
+        """The kept targets in the rover frame of now: name, position, covariance."""
+        pose = self.tracker.pose
         for name, one in self.targets.known.items():
             position, covariance = np.array(one["position_m"]), one["covariance_m2"]
             if one["frame"] == "site" and pose is not None:
@@ -336,9 +360,7 @@ class Service:
                 position = here.points(position)
                 if covariance is not None:
                     covariance = here.rotation @ np.array(covariance) @ here.rotation.T
-            if (place := in_picture(camera, position, covariance)) is not None:
-                shown[name] = place
-        return shown
+            yield name, position, covariance
 
     def track_in(self, frame: StampedFrame) -> dict[str, float] | None:
         """Return where a frame should show the track's target, pixels, with one sigma as an ellipse.

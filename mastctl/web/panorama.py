@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import FastAPI, Path, Request
 from fastapi.responses import FileResponse, Response
 
-from mastctl.answers import PanoramaList, Started, TargetList
+from mastctl.answers import PanoramaDrawn, PanoramaList, Started, TargetList
 from mastctl.control.entry import PANORAMA, TARGET_FORGET, TARGET_KEEP
 from mastctl.http import PREFIX
 from mastctl.panorama.folder import Index
@@ -58,6 +58,13 @@ def add_panoramas(app: FastAPI) -> None:
     async def picture(name: Panorama, here: Here) -> Response:
         data = await here.waiting.run(lambda: here.service.panoramas.so_far(name))
         return Response(data, media_type="image/jpeg")
+
+    @app.get(
+        f"{PREFIX}/panoramas/{{name}}/drawing",
+        summary="What is drawn over it: where the head looks now, targets",
+    )
+    async def drawing(name: Panorama, here: Here) -> PanoramaDrawn:
+        return await here.waiting.run(lambda: here.service.panorama_drawn(name))
 
     @app.get(
         f"{PREFIX}/panoramas/{{name}}/files/{{file:path}}",

@@ -128,6 +128,20 @@ def test_a_scene_that_has_changed_is_said_and_direction_alone_is_offered(
     assert "no residual" in alone["pointings"][0]["note"]
 
 
+def test_head_and_targets_are_drawn_where_they_are_seen(client: Client, panorama: dict[str, Any]) -> None:
+    target, mosaic, view = pixel_of(panorama, 0.35, 0.4), panorama["mosaic"], panorama["views"][0]
+    client.wait(client.point(pan_rad=view["pan_rad"], tilt_rad=view["tilt_rad"]))
+    seen: Any = client.daemon.json(dict, "POST", "/point/preview", json={"panorama": target})
+    client.keep_target("rock", seen["position_m"])
+    shown: Any = client.daemon.json(dict, "GET", f"/panoramas/{panorama['id']}/drawing")
+    client.forget_target("rock")
+    assert shown["size_px"] == mosaic["size_px"]
+    np.testing.assert_allclose(shown["targets_px"]["rock"], [target["x_px"], target["y_px"]], atol=0.5)
+    middle = (np.min(shown["view_px"], axis=0) + np.max(shown["view_px"], axis=0)) / 2.0
+    away_px = mosaic["px_per_rad"] * (view["pan_rad"] - mosaic["azimuth_rad"])
+    assert middle[0] == pytest.approx(away_px, abs=0.05 * mosaic["px_per_rad"])
+
+
 def test_a_pixel_beside_the_views_is_refused(client: Client, panorama: dict[str, Any]) -> None:
     beside = {"id": panorama["id"], "x_px": -50.0, "y_px": 3.0}
     assert "shows no view" in refused("outside_panorama", lambda: client.point(panorama=beside))
