@@ -24,8 +24,6 @@ ARROW_PART = 0.025
 """The typical residual is drawn this part of the image's width long."""
 
 MANY_DOTS = 2500
-NAME_SPACE_M = 0.5
-"""A board's name is left out where another name is nearer than this."""
 
 SIDES = ((1, plots.BLUE, "came from smaller angles"), (-1, plots.RUST, "came from larger angles"),
          (0, plots.GREY, "came from either side"))  # fmt: skip
@@ -198,23 +196,12 @@ def boards(fit: Calibration, board: Board) -> Any:
         purposes.setdefault((image.setup, image.placement), image.purpose)
     colour_of = {"camera": plots.BLUE, "mast": plots.GREEN, "check": plots.RUST}
     views = ((plan, (1, 0)), (side, (0, 2)))
-    labelled: set[str] = set()
-    names: list[np.ndarray] = []
+    labels = {purpose: f"boards: {purpose}" for purpose in colour_of}
     for key, pose in fit.rover_from_board.items():
-        purpose = purposes.get(key, "camera")
-        outline = pose.points(corners)
-        label = None if purpose in labelled else f"boards: {purpose}"
-        labelled.add(purpose)
+        purpose, outline = purposes.get(key, "camera"), pose.points(corners)
+        label = labels.pop(purpose, None)
         for axis, (across, up) in views:
             axis.plot(outline[:, across], outline[:, up], color=colour_of[purpose], lw=1.5, label=label)
-        place = outline[1, [1, 0]]
-        free = all(abs(place - other) @ (0.35, 1.0) > NAME_SPACE_M for other in names)
-        if purpose != "camera" and free:  # those of a ring stand too close together for names
-            names.append(place)
-            name = plan.annotate(
-                key[1], place, fontsize=7, color="0.25", xytext=(2, 2), textcoords="offset points"
-            )
-            name.set_parse_math(False)  # a name with two dollars is no formula
     for index, camera in enumerate(fit.rig.cameras):
         model = fit.rig.camera_in_rover(camera, 0.0, 0.0)
         ahead = Rigid(np.eye(3), model.C).points(0.8 * np.asarray(model.A))

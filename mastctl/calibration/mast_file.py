@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -14,11 +14,9 @@ import numpy as np
 
 from calib.adjust.hypotheses import Finding
 from calib.adjust.result import BenchCalibration, Calibration
-from calib.adjust.uncertainty import sigma_by_key
 from calib.files import keep_previous, previous_path
 from calib.files.mast_file import StoredRig, save_rig
 from calib.files.yaml_text import plain
-from calib.geometry.covariance import RigCovariance
 from calib.geometry.rig import Rig
 from calib.survey.records import Survey
 from mastctl.as_json import as_json
@@ -103,41 +101,15 @@ def with_fit(fit: Calibration | BenchCalibration, survey: Survey, verdict: Calib
         "survey": survey.folder.resolve().name,
         "survey_digest": survey.digest,
         "versions": {"python": platform.python_version(), **{name: version(name) for name in LIBRARIES}},
-        **_made(),
+        **made(),
     }
     return replace(fit.rig, fit=whole, provenance=provenance)
-
-
-def with_correction(
-    mast: StoredRig,
-    rig: Rig,
-    known: RigCovariance | None,
-    corrected: Mapping[str, Any],
-    by: Mapping[str, Any],
-) -> Rig:
-    """Return a corrected rig with ``fit`` and ``provenance`` that say by what it was corrected.
-
-    What else the former file has under ``fit`` stays as its survey left it. ``known`` is the corrected rig's
-    covariance, None where the former file has none; ``corrected`` comes under ``fit``, ``by`` into the
-    provenance's list of corrections.
-    """
-    fit = {**mast.rig.fit, **corrected}
-    if known is not None:
-        fit["covariance"] = rounded_matrix(known.covariance).tolist()
-        fit["sigma"] = plain(sigma_by_key(rig, known.names, known.covariance))
-    before = mast.rig.provenance.get("refined", [])
-    former = {"former_file": mast.path.name, "former_digest": mast.digest}
-    refined = [*(before if isinstance(before, list) else [before]), {**former, **by, **_made()}]
-    return replace(rig, fit=fit, provenance={**mast.rig.provenance, "refined": refined})
 
 
 def save_new(rig: Rig, out: Path) -> tuple[StoredRig, Path | None]:
     """Save a mast file and keep every former version; return it, and the name of the last one.
 
-    Raises
-    ------
-    BadFile
-        If ``out`` cannot be written; it holds what it held before.
+    Raises BadFile if ``out`` cannot be written; it is as it was then.
     """
     was_there = out.exists()
     kept = keep_previous(out) if was_there else None
@@ -155,7 +127,7 @@ def rounded_matrix(matrix: np.ndarray) -> np.ndarray:
     return np.asarray(np.tril(half) + np.tril(half, -1).T)
 
 
-def _made() -> dict[str, Any]:
-    """By which program, and when."""
+def made() -> dict[str, Any]:
+    """Return by which program a mast file is made, and when."""
     date = datetime.now(UTC).isoformat(timespec="seconds")
     return {"program": f"mastctl {version('mastctl')}", "date": date}

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from calib.adjust.uncertainty import sigma_by_key
 from calib.calibrate.body import (
     PRIOR_SHIFT_M,
     PRIOR_TURN_RAD,
@@ -18,10 +20,11 @@ from calib.calibrate.body import (
 )
 from calib.errors import NoCorrection
 from calib.files.mast_file import StoredRig
+from calib.files.yaml_text import plain
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
 from calib.matching.handoff import MatchedHandoff, handoff_bias
-from mastctl.calibration.mast_file import picked, rounded_matrix, with_correction
+from mastctl.calibration.mast_file import made, picked, rounded_matrix
 from mastctl.watch.handoffs import ReadLog, bias_record
 
 SHIFT_FIRST = (3, 4, 5, 0, 1, 2)
@@ -88,7 +91,14 @@ def _corrected(mast: StoredRig, significant: dict[str, BodyPose], logs: Sequence
         "records": [{"file": log.path.name, "digest": log.digest} for log in logs],
         "handoffs": {group: len(pose.used.handoffs) for group, pose in significant.items()},
     }
-    return with_correction(mast, rig, known, {"refined": corrections}, by)
+    fit = {**mast.rig.fit, "refined": corrections}  # the rest stays as its survey left it
+    if known is not None:
+        fit["covariance"] = rounded_matrix(known.covariance).tolist()
+        fit["sigma"] = plain(sigma_by_key(rig, known.names, known.covariance))
+    before = mast.rig.provenance.get("refined", [])
+    former = {"former_file": mast.path.name, "former_digest": mast.digest}
+    refined = [*(before if isinstance(before, list) else [before]), {**former, **by, **made()}]
+    return replace(rig, fit=fit, provenance={**mast.rig.provenance, "refined": refined})
 
 
 def _pose_as_json(pose: BodyPose) -> dict[str, Any]:

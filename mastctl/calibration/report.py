@@ -166,8 +166,7 @@ def _drawn(survey: Survey, fit: AnyFit) -> Iterable[tuple[str, Any, str, str]]:
             "Where the boards stood",
             drawn.boards(fit, survey.board),
             "boards in plan and side view",
-            "In the rover frame, so boards that the rover saw while it was tilted back stand low. Boards for "
-            "the mast and for checks are named where there is space.",
+            "In the rover frame, so boards that the rover saw while it was tilted back stand low.",
         )
     yield (
         "How sure projection is over the images",

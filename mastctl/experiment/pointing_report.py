@@ -39,10 +39,7 @@ CSV_COLUMNS = (
 def write_pointing_report(experiment: PointingExperiment, folder: Path) -> Path:
     """Write report.html, targets.csv and record.json into ``folder`` (made if need be); return the page.
 
-    Raises
-    ------
-    OSError
-        If the folder or a file in it cannot be written.
+    Raises OSError if the folder or a file in it cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_csv(folder / "targets.csv", CSV_COLUMNS, [_csv_row(record) for record in experiment.records])
