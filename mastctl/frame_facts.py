@@ -11,28 +11,16 @@ from typing import Any
 
 @dataclass(frozen=True, eq=False)
 class FrameFacts:
-    """What a picture is worth little without.
+    """What a picture is worth little without; ``sequence`` is the camera's own count.
 
-    Attributes
-    ----------
-    frame_id, camera, sequence
-        Its name; the camera's name in the mast file; the camera's own count.
-    mid_exposure_s, exposure_s
-        Middle of the exposure, seconds of CLOCK_MONOTONIC, and its length, seconds.
-    pan_rad, tilt_rad
-        Joint angles at mid-exposure, radians, interpolated from the measured ones around it: as read.
-    moving
-        Whether the head moved, or was told to, at any time of the exposure.
-    mast_digest
-        SHA-256 (hex) of the mast file in use.
-    true_pan_rad, true_tilt_rad
-        Where the axes truly stood by its ``joints``: what a camera's place follows from.
-    pan_approach, tilt_approach
-        From which side each axis had come: 1 from smaller readings, -1 from larger, 0 not known, between
-        them where it had not gone through all of its play.
-    settings
-        Exposure time, gain, ... that it was taken with, by the names of `drivers.interfaces.SETTINGS`; None
-        for what is not known of this picture, as while it was being changed.
+    ``mid_exposure_s`` is of CLOCK_MONOTONIC. The joint angles are those at mid-exposure, interpolated from
+    the measured ones around it: as read, and true by the ``joints`` of the mast file, whose SHA-256 (hex) is
+    ``mast_digest``. ``moving``: whether the head moved, or was sent, at any time of the exposure.
+
+    ``pan_approach`` and ``tilt_approach`` say from which side each axis had come: 1 from smaller readings, -1
+    from larger, 0 not known, between them where it had not gone through all of its play. ``settings`` has
+    exposure time, gain, ... by the names of `drivers.interfaces.SETTINGS`; None for what is not known of this
+    picture, as while it was being changed.
     """
 
     frame_id: str
@@ -58,18 +46,12 @@ class FrameFacts:
 
 def headers_of(facts: FrameFacts) -> dict[str, str]:
     """Return the facts as headers; numbers in shortest round-trip form."""
-    told = {header: getattr(facts, name) for name, header in _HEADERS.items()}
-    return {header: value if isinstance(value, str) else json.dumps(value) for header, value in told.items()}
+    values = {header: getattr(facts, name) for name, header in _HEADERS.items()}
+    return {name: value if isinstance(value, str) else json.dumps(value) for name, value in values.items()}
 
 
 def facts_in(headers: Mapping[str, str]) -> dict[str, Any]:
-    """Return the facts that stand in headers, by name.
-
-    Raises
-    ------
-    KeyError, ValueError
-        If one is missing, or is no value of its kind.
-    """
+    """Return the facts in headers, by name. Raises KeyError, ValueError if one is missing or wrong."""
     return {one.name: _READ[str(one.type)](headers[_HEADERS[one.name]]) for one in fields(FrameFacts)}
 
 
@@ -84,10 +66,10 @@ def described_headers() -> dict[str, Any]:
 
 def _settings_in(text: str) -> dict[str, float | None]:
     """What a picture was taken with, from JSON. Raises ValueError."""
-    told = json.loads(text)
-    if not isinstance(told, dict) or not all(value is None or _is_number(value) for value in told.values()):
+    stated = json.loads(text)
+    if not isinstance(stated, dict) or not all(one is None or _is_number(one) for one in stated.values()):
         raise ValueError("an object of numbers is expected")
-    return {name: None if value is None else float(value) for name, value in told.items()}
+    return {name: None if value is None else float(value) for name, value in stated.items()}
 
 
 def _is_number(value: object) -> bool:
