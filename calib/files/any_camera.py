@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,7 +30,6 @@ from calib.files.opencv_ros import (
 )
 from calib.files.twin import (
     FISHEYE,
-    GOOD_PX,
     TwinError,
     as_kind,
     error_sentence,
@@ -223,30 +222,30 @@ def nearest_lens(
             return name, same, twin_error(model, same)
     if len(lenses) > 3:  # the others are as near as one of these, or nearly so
         lenses = tuple(one for one in lenses if one not in ("radtan", "thin_prism", "tilted"))
-    names: list[str] = []
-    tried: list[tuple[CameraModel, TwinError]] = []
-    problem = ""
-    for name in lenses:
-        try:
-            with np.errstate(all="ignore"):
-                if name == "cahvor":
-                    twin = nearest_cahvor(model, limit_px)
+    problems = [""]
+
+    def twins() -> Iterator[CameraModel]:
+        for name in lenses:
+            try:
+                with np.errstate(all="ignore"):
+                    twin = (
+                        nearest_cahvor(model, limit_px)
+                        if name == "cahvor"
+                        else nearest_opencv(model, LENSES[name])
+                    )
                     off_rad = internal_parameters(twin)["Theta"] + np.pi / 2  # H and V's of a right angle
-                    twin = twin if to == "cahvor" or abs(off_rad) < 1e-12 else nearest_square(twin)
-                else:
-                    twin = nearest_opencv(model, LENSES[name])
-                error = twin_error(model, twin)
-        except (ValueError, np.linalg.LinAlgError) as reason:
-            problem = str(reason)
-            continue
-        names.append(twin.kind if to == "cahvor" else name)
-        tried.append((twin, error))
-        if error.worst_px <= GOOD_PX:
-            return names[-1], twin, error
-    if not tried:
-        raise ValueError(problem)
-    at = plainest(tried, limit_px)
-    return names[at], *tried[at]
+                    if name == "cahvor" != to and abs(off_rad) > 1e-12:
+                        twin = nearest_square(twin)
+            except (ValueError, np.linalg.LinAlgError) as reason:
+                problems.append(str(reason))
+            else:
+                yield twin
+
+    if (found := plainest(model, twins(), limit_px)) is None:
+        raise ValueError(problems[-1])
+    name_of = {kind: name for name, kind in LENSES.items()}
+    name = found[0].kind if to == "cahvor" else name_of.get(found[0].kind, "cahvor")
+    return name, *found
 
 
 def _why(model: CameraModel) -> str:

@@ -4,7 +4,7 @@ mrcal's ``.cameramodel`` is a Python mapping in text, one camera with its pose. 
 a rotation vector and a translation from the reference frame, whose name the file has no place for, to camera
 axes. LENSMODEL_CAHVOR and LENSMODEL_CAHVORE_linearity=p hold fx fy cx cy, alpha and beta, R0 R1 R2, and E0 E1
 E2. O is (sin α cos β, sin β, cos α cos β) in camera axes. Since 2.5 ``extrinsics`` are called ``rt_cam_ref``
-too; before 1.0 the lens stood under ``lens_model`` or, as DISTORTION_..., under ``distortion_model``. They
+too; before 1.0 the lens was under ``lens_model`` or, as DISTORTION_..., under ``distortion_model``. They
 are exact twins of ours if H and V are at right angles. LENSMODEL_PINHOLE and OPENCV4, 5, 8, 12 are read too,
 and OPENCV5 and 8 written on request. Source: https://mrcal.secretsauce.net/cameramodels.html and
 lensmodels.html.

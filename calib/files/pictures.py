@@ -16,7 +16,7 @@ PNG_BEGINS = b"\x89PNG\r\n\x1a\n"
 JPEG_SCAN = 0xDA
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 AS_STORED = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-"""Grey, all bits of a sample, and not turned as a camera's tag may ask."""
+"""Grey, all bits of a sample, and not turned as a camera's tag says."""
 
 # What OpenCV logs goes past Python's handlers; each caller says itself what is wrong.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

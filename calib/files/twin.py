@@ -9,7 +9,7 @@ twin.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -163,12 +163,22 @@ def _plain_start(model: CameraModel, kind: Kind) -> CameraModel:
     return CameraModel.of_matrix(kind, model.size_px, matrix, distortion, axes.T, model.C)
 
 
-def plainest(tried: Sequence[tuple[CameraModel, TwinError]], limit_px: float) -> int:
-    """Return which of several twins to take, the plainest first: one within the limit that is at most twice
-    as far off as the nearest, else the nearest."""
-    worst = [error.worst_px for _, error in tried]
-    near = [at for at, px in enumerate(worst) if px <= min(limit_px, 2.0 * min(worst))]
-    return near[0] if near else int(np.argmin(worst))
+def plainest(
+    model: CameraModel, twins: Iterable[CameraModel], limit_px: float
+) -> tuple[CameraModel, TwinError] | None:
+    """Return which of several twins of a model to take, the plainest first, with its error.
+
+    It is one within the limit that is at most twice as far off as the nearest, else the nearest; after one
+    within ``GOOD_PX`` no further is tried. None if there is none.
+    """
+    tried: list[tuple[CameraModel, TwinError]] = []
+    for twin in twins:
+        tried.append((twin, twin_error(model, twin)))
+        if tried[-1][1].worst_px <= GOOD_PX:
+            return tried[-1]
+    nearest_px = min((error.worst_px for _, error in tried), default=np.inf)
+    near = [one for one in tried if one[1].worst_px <= min(limit_px, 2.0 * nearest_px)]
+    return next(iter(near or sorted(tried, key=lambda one: one[1].worst_px)), None)
 
 
 def nearest_cahvor(camera: CameraModel, limit_px: float = np.inf) -> CameraModel:
@@ -184,15 +194,14 @@ def nearest_cahvor(camera: CameraModel, limit_px: float = np.inf) -> CameraModel
     fisheye = camera.kind == FISHEYE
     plain: tuple[Kind, int] = ("CAHVORE", 2) if fisheye else ("CAHVOR", 0)
     r, linearity = np.array([0.0, *camera.distortion[:2]]), 0.0 if fisheye else 1.0
-    tried: list[tuple[CameraModel, TwinError]] = []
-    for kind, cahvore_type in (plain, ("CAHVORE", 3)):
+
+    def fitted(kind: Kind, cahvore_type: int) -> CameraModel:
         lens = replace(camera, kind=kind, cahvore_type=cahvore_type, distortion=np.zeros(0))
-        start = replace(lens, O=camera.A, R=r, linearity=linearity)
-        found = _fit(start, *seen, skew=True)
-        tried.append((found, twin_error(camera, found)))
-        if tried[-1][1].worst_px <= GOOD_PX:
-            break
-    return tried[plainest(tried, limit_px)][0]
+        return _fit(replace(lens, O=camera.A, R=r, linearity=linearity), *seen, skew=True)
+
+    found = plainest(camera, (fitted(*kind) for kind in (plain, ("CAHVORE", 3))), limit_px)
+    assert found is not None
+    return found[0]
 
 
 def nearest_square(model: CameraModel) -> CameraModel:

@@ -161,7 +161,7 @@ def dump_mapping(data: Mapping[str, Any]) -> bytes:
     """Return plain data (else TypeError) as YAML: keys in their order, vectors on one line, floats in
     shortest form.
 
-    Words that YAML 1.1 reads as something else (``on``) are quoted, so every YAML reader agrees.
+    Text that YAML 1.1 reads as something else (``on``) is quoted, so every YAML reader agrees.
     """
     text = yaml.dump(
         plain(data),

@@ -2,7 +2,7 @@
 
 The station (prisms, tapes) and the rough camera predict where the board is. A plain mast carries the camera
 to each image's joint angles: pan about a vertical axis amid the head's rough cameras, tilt about y. Rough
-cameras are good to 20 cm and 10 degrees, and so is this. Cameras without a rough place are taken as upright.
+cameras are good to 20 cm and 10 degrees, and so is this. Cameras without a rough place are assumed upright.
 """
 
 from __future__ import annotations

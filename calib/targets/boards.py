@@ -99,7 +99,7 @@ class Checkerboard(_Squares):
     """A plain chessboard, the square in its upper left corner black.
 
     It has no markers, so it must be seen whole. If columns and rows are both even or both odd it looks the
-    same upside down; then the side that is up in the image counts as its upper side.
+    same upside down; then the side that is up in the image is its upper side.
     """
 
     kind: ClassVar[Literal["checkerboard"]] = "checkerboard"
