@@ -285,12 +285,7 @@ def pointing_covariance(
 
     The target is ``range_m`` along the ray of ``left_px`` in the left image at the given joint angles. It is
     found by stereo with the calibrated rig, and the head is pointed so that it should land in the middle of
-    the left image (`calib.geometry.covariance`).
-
-    Raises
-    ------
-    CalibError
-        If the target is not seen by both cameras, or cannot be pointed at.
+    the left image. Raises CalibError if the target is not seen by both cameras, or cannot be pointed at.
     """
     rig = calibration.rig
     rays = rig.camera_in_rover(pair[0], pan_rad, tilt_rad).ray(left_px)

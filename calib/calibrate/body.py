@@ -171,11 +171,8 @@ def body_sights(rig: Rig, cameras: Sequence[str], handoffs: Sequence[MatchedHand
     left out. Clicks may be matches, so ``MODEL_PX`` counts for them too.
     """
     known = stored_covariance(rig)
-    used, rows, apart = (
-        list[MatchedHandoff](),
-        list[tuple[FloatArray, ...]](),
-        list[tuple[MatchedHandoff, RayGap]](),
-    )
+    used, rows = list[MatchedHandoff](), list[tuple[FloatArray, ...]]()
+    apart = list[tuple[MatchedHandoff, RayGap]]()
     for one in handoffs:
         if not all(name in rig.cameras and rig.cameras[name].on == "head" for name in one.pair):
             continue
@@ -209,14 +206,13 @@ def body_sights(rig: Rig, cameras: Sequence[str], handoffs: Sequence[MatchedHand
         covariance = target.covariance_m2 + sigma_rad**2 * turned @ turned.T
         used.append(one)
         rows.append((target.position_m, covariance, target.rates_m_per_px, found, noise, seen))
-    k = len(cameras)
-    shapes = ((3,), (3, 3), (3, 4), (k, 2), (k, 2, 2), (k,))
-    position, covariance, rates, found, noise, seen = (
-        np.array([row[i] for row in rows]).reshape(len(rows), *shape) for i, shape in enumerate(shapes)
+    positions_m, covariances_m2, rates, found, noise, seen = (
+        np.array(column) for column in (zip(*rows, strict=True) if rows else [()] * 6)
     )
+    origin_m = np.mean([rig.cameras[name].model.C for name in cameras], axis=0)
     return BodySights(
-        rig, tuple(cameras), np.mean([rig.cameras[name].model.C for name in cameras], axis=0), tuple(used),
-        position, covariance, rates, found, noise, seen.astype(bool), tuple(apart),
+        rig, tuple(cameras), origin_m, tuple(used), positions_m, covariances_m2, rates, found, noise, seen,
+        tuple(apart),
     )  # fmt: skip
 
 
@@ -396,11 +392,11 @@ def _correction(used: BodySights, fit: _BodyFit, outliers: tuple[Outlier, ...]) 
     for k, name in enumerate(used.cameras):
         on = used.seen[:, k]
         if on.any():
-            sizes = [
+            before, after = (
                 np.sqrt(np.mean(at.residual_px[on, 2 * k : 2 * k + 2] ** 2, axis=0)).tolist()
                 for at in (fit.before, fit.after)
-            ]
-            rms[name] = ((sizes[0][0], sizes[0][1]), (sizes[1][0], sizes[1][1]))
+            )
+            rms[name] = (before[0], before[1]), (after[0], after[1])
     return BodyPose(
         cameras=used.cameras,
         origin_m=used.origin_m,
