@@ -29,7 +29,7 @@ STOP_ANSWER_S = 3.0  # the devices give a stop 1 s; beyond this the answer is th
 NOTHING: Mapping[str, Any] = {}
 
 
-async def _asked(
+async def _requested(
     request: Request,
     here: Here,
     mastctl_client: Annotated[str | None, Header(description="The client's name")] = None,
@@ -48,7 +48,7 @@ async def _asked(
     )
 
 
-Asks = Annotated[CommandRequest, Depends(_asked)]
+Requested = Annotated[CommandRequest, Depends(_requested)]
 """What the headers of a request for a command say, and when it came."""
 
 
@@ -65,21 +65,11 @@ def command(
 ) -> Callable[[F], F]:
     """Add the route of a command, whose function carries it out, in a worker thread, once the entry lets it.
 
-    The function takes what the path, the query and the body hold, and ``here`` and ``asked`` (`Asks`) if it
-    needs them.
-
-    Parameters
-    ----------
-    route
-        Method and path below the prefix, ``POST /point``.
-    usual_s
-        What an operation of it is given if nothing else was asked for, from ``here`` and what the function
-        takes.
-    recorded
-        What it is recorded and known again by, from what the function takes; by default the path, the query
-        and the body.
-    beside
-        Whether it stops something: it runs in the stops' own threads then, and each try is carried out.
+    ``route`` is method and path below the prefix, ``POST /point``. The function takes the path, the query and
+    the body, and ``here`` and ``requested`` (`Requested`) if it needs them. ``usual_s``, of ``here`` and the
+    function's parameters, is an operation's time without a deadline. ``recorded``, of the function's
+    parameters, is what the command is recorded and recognised by; by default path, query and body.
+    ``beside``: it stops something, so it runs in the stops' own threads, and each try is carried out.
     """
     method, _, path = route.partition(" ")
 
@@ -87,15 +77,19 @@ def command(
         wanted = inspect.signature(act, eval_str=True)
 
         async def endpoint(
-            request: Request, here: Parts, asked: CommandRequest, **given: Any
+            request: Request, here: Parts, requested: CommandRequest, **given: Any
         ) -> Mapping[str, Any]:
-            own = {name: one for name, one in (("here", here), ("asked", asked)) if name in wanted.parameters}
+            own = {
+                name: one
+                for name, one in (("here", here), ("requested", requested))
+                if name in wanted.parameters
+            }
             sent = recorded(**given, **own) if recorded is not None else _request_of(given)
             allowed_s = None if usual_s is None else usual_s(here, **given)
             work = partial(act, **given, **own)
-            return await carried_out(here, request, kind, asked, sent, work, allowed_s, beside)
+            return await carried_out(here, request, kind, requested, sent, work, allowed_s, beside)
 
-        kinds = {"request": Request, "here": Here, "asked": Asks}
+        kinds = {"request": Request, "here": Here, "requested": Requested}
         parameters = [Parameter(name, Parameter.KEYWORD_ONLY, annotation=one) for name, one in kinds.items()]
         parameters += [
             one.replace(kind=Parameter.KEYWORD_ONLY)
@@ -115,7 +109,7 @@ async def carried_out(
     here: Parts,
     request: Request,
     kind: Command,
-    asked: CommandRequest,
+    requested: CommandRequest,
     sent: Mapping[str, Any],
     act: Callable[[], Answer],
     usual_s: float | None = None,
@@ -124,15 +118,15 @@ async def carried_out(
     """Return the answer of a command, whose refusals are those of `mastctl.control.entry.CommandEntry.run`.
 
     A ``deadline_s`` in what is ``sent`` counts as the header does, the shorter of both. ``beside``: of the
-    request nothing is kept but who asks, when, and under which lease.
+    request only the client, the time and the lease are kept.
     """
     request.scope["state"]["recorded"] = True  # whatever comes of it
-    deadline_s = _shorter(asked.deadline_s, sent.get("deadline_s"))
+    deadline_s = _shorter(requested.deadline_s, sent.get("deadline_s"))
     if beside:
-        asked = replace(asked, key=None)
-        return await stopped(here.service, lambda: here.service.entry.run(kind, asked, act))
-    asked = replace(asked, request=sent, deadline_s=deadline_s)
-    return await here.waiting.run(lambda: here.service.entry.run(kind, asked, act, usual_s))
+        requested = replace(requested, key=None)
+        return await stopped(here.service, lambda: here.service.entry.run(kind, requested, act))
+    requested = replace(requested, request=sent, deadline_s=deadline_s)
+    return await here.waiting.run(lambda: here.service.entry.run(kind, requested, act, usual_s))
 
 
 async def stop_first(
@@ -143,14 +137,14 @@ async def stop_first(
     sent: Mapping[str, Any] = NOTHING,
     late: Callable[[], Awaitable[Mapping[str, Any]]] | None = None,
 ) -> Answer:
-    """Return the answer of a stop: nothing is asked and no header is judged before it acts.
+    """Return the answer of a stop, which acts before any check.
 
     ``late`` returns what was ``sent`` after that; the stop is recorded with it then.
     """
-    asked = CommandRequest(caller_of(request), request=sent, lease=request.headers.get("mastctl-lease"))
+    requested = CommandRequest(caller_of(request), request=sent, lease=request.headers.get("mastctl-lease"))
     entry, answer, failure = here.service.entry, None, None
     try:
-        answer = await stopped(here.service, lambda: entry.first(kind, asked, act, late is None))
+        answer = await stopped(here.service, lambda: entry.first(kind, requested, act, late is None))
         return answer
     except BaseException as error:
         failure = error
@@ -158,10 +152,10 @@ async def stop_first(
     finally:
         try:
             if late is not None:
-                asked = replace(asked, request=await late())
+                requested = replace(requested, request=await late())
         finally:
             if late is not None or isinstance(failure, StopsHang):
-                entry.record(kind, asked, answer, failure, begins=False)
+                entry.record(kind, requested, answer, failure, begins=False)
 
 
 async def stopped(service: Service, stop: Callable[[], T]) -> T:
@@ -169,12 +163,12 @@ async def stopped(service: Service, stop: Callable[[], T]) -> T:
     try:
         return await asyncio.wait_for(asyncio.wrap_future(service.stop_threads.submit(stop)), STOP_ANSWER_S)
     except TimeoutError:
-        words = f"the stop did not come back within {STOP_ANSWER_S:g} s; the head may still move"
-        raise Unable("stop_pending", words) from None
+        message = f"the stop did not come back within {STOP_ANSWER_S:g} s; the head may still move"
+        raise Unable("stop_pending", message) from None
 
 
 def caller_of(request: Request) -> Caller:
-    """Return who asks, as whoever let the request in found; else by its name alone."""
+    """Return the caller that the guard found; else one by its name alone."""
     caller = request.scope.get("state", {}).get("caller")
     return (
         caller if isinstance(caller, Caller) else Caller(client_name(request.headers.get("mastctl-client")))

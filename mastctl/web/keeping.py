@@ -38,7 +38,7 @@ from mastctl.control.entry import (
 )
 from mastctl.http import PREFIX
 from mastctl.service.masts import MastInUse, Masts
-from mastctl.web.commands import Asks, command
+from mastctl.web.commands import Requested, command
 from mastctl.web.described import file_of
 from mastctl.web.models import BenchBody, MastBody, PlaceBody, RecordBody
 from mastctl.web.parts import Here
@@ -171,9 +171,9 @@ def add_bench(app: FastAPI) -> None:
         status_code=202,
         recorded=lambda body, **_: _without_file(body),
     )
-    def begin(body: BenchBody, here: Here, asked: Asks) -> BenchAnswer:
+    def begin(body: BenchBody, here: Here, requested: Requested) -> BenchAnswer:
         bench = here.service.bench
-        return {"run": bench.start(asked.caller.name, asked.last_stop, **body.model_dump())}
+        return {"run": bench.start(requested.caller.name, requested.last_stop, **body.model_dump())}
 
     @command(app, "POST /bench/stands", BENCH_STANDS, "Say that the board stands where it was asked for")
     def stands(here: Here) -> BenchAnswer:
@@ -182,8 +182,8 @@ def add_bench(app: FastAPI) -> None:
     @command(
         app, "POST /bench/leave", BENCH_LEAVE, "End the bench calibration; it can go on later", beside=True
     )
-    def leave(here: Here, asked: Asks) -> BenchAnswer:
-        return {"run": here.service.bench.leave(asked.caller.name)}
+    def leave(here: Here, requested: Requested) -> BenchAnswer:
+        return {"run": here.service.bench.leave(requested.caller.name)}
 
     @command(
         app,

@@ -365,7 +365,7 @@ class EventsQuery(BaseModel):
 
 
 class ImagesQuery(BaseModel):
-    """``GET /images``, a WebSocket: of which cameras; whether their first pictures are asked for too, and all
+    """``GET /images``, a WebSocket: of which cameras; whether their first pictures are requested too, and all
     of them come at the cameras' own rate.
     """
 

@@ -150,7 +150,7 @@ def add_simulation(app: FastAPI) -> None:
 
 
 def _rover(service: Service, what: str) -> RoverModel:
-    """The simulated rover, whose ``what`` are asked for. Raises NotKnown."""
+    """The simulated rover, whose ``what`` are requested. Raises NotKnown."""
     if service.hardware.simulation is None:
         kind = service.hardware.kind
         message = f"{what} are for this program's own simulated rover only; the hardware is {kind}"
@@ -183,7 +183,7 @@ def _time(service: Service) -> SimulationTime:
 
 
 def _truth(service: Service, query: TruthQuery) -> PointTruth:
-    """The truth asked for. Raises NoLonger and as `frame_by_id`."""
+    """The truth requested. Raises NoLonger and as `frame_by_id`."""
     rover = _rover(service, "truths")
     frame = service.devices.frame_by_id(query.frame_id)
     try:

@@ -56,7 +56,7 @@ from mastctl.safety.latch import LONGEST
 from mastctl.service.service import Service
 from mastctl.service.steering import usual_s
 from mastctl.service.stopping import StopsHang
-from mastctl.web.commands import Asks, carried_out, command, stop_first
+from mastctl.web.commands import Requested, carried_out, command, stop_first
 from mastctl.web.models import (
     EstopBody,
     LeaseBody,
@@ -124,12 +124,14 @@ def add_pointing(app: FastAPI) -> None:
         f"{PREFIX}/operations/{{operation_id}}/stop",
         summary="Stop the mast and one operation, if it still runs; what another client began goes on",
     )
-    async def stop_one(operation_id: str, request: Request, here: Here, asked: Asks) -> OperationTold:
+    async def stop_one(
+        operation_id: str, request: Request, here: Here, requested: Requested
+    ) -> OperationTold:
         def act() -> dict[str, Any]:  # no id: it begins nothing
             here.service.operations.stop_one(operation_id)
             return {}
 
-        await carried_out(here, request, OPERATION_STOP, asked, {}, act, beside=True)
+        await carried_out(here, request, OPERATION_STOP, requested, {}, act, beside=True)
         return here.service.operations.get(operation_id).as_json()
 
     @app.post(f"{PREFIX}/stop", summary="Stop the mast and the running operation, at once")
@@ -204,8 +206,8 @@ def add_tracking(app: FastAPI) -> None:
         "Say where the rover stands; a track is carried over and looked for",
         usual_s=one_look_s,
     )
-    def pose(body: PoseBody, here: Here, asked: Asks) -> PoseTaken:
-        operation = here.service.steering.take_pose(body.pose(asked.came_s), body.look)
+    def pose(body: PoseBody, here: Here, requested: Requested) -> PoseTaken:
+        operation = here.service.steering.take_pose(body.pose(requested.came_s), body.look)
         stop_before_keep_outs(here.service)  # a sun of the site frame turns with the rover
         return {"operation": operation, "track": here.service.track_answer()}
 
@@ -237,12 +239,12 @@ def add_tracking(app: FastAPI) -> None:
         return {"id": here.service.steering.look().id}
 
     @app.post(f"{PREFIX}/track/stop", summary="End the track; the head stops if it moves for it")
-    async def stop(request: Request, here: Here, asked: Asks) -> TrackTold:
+    async def stop(request: Request, here: Here, requested: Requested) -> TrackTold:
         def act() -> dict[str, Any]:  # no id: it begins nothing
             here.service.stopping.stop_track()
             return {}
 
-        await carried_out(here, request, TRACK_STOP, asked, {}, act, beside=True)
+        await carried_out(here, request, TRACK_STOP, requested, {}, act, beside=True)
         return here.service.track_answer()
 
 
@@ -258,9 +260,9 @@ def add_limits(app: FastAPI) -> None:
         return here.service.devices.judge.sun_as_json()
 
     @command(app, "POST /limits/sun", SUN, "Say where the sun stands; the head keeps off it")
-    def tell(body: SunBody, here: Here, asked: Asks) -> SunTold:
+    def tell(body: SunBody, here: Here, requested: Requested) -> SunTold:
         judge = here.service.devices.judge
-        judge.use_sun(body.sun(asked.came_s))
+        judge.use_sun(body.sun(requested.came_s))
         stop_before_keep_outs(here.service)
         return judge.sun_as_json()
 
@@ -286,35 +288,42 @@ def add_lease(app: FastAPI) -> None:
         return {"control": here.service.leases.as_json()}
 
     @command(app, "POST /lease", LEASE, "Acquire the lease, if no other client steers")
-    def acquire(body: LeaseBody, here: Here, asked: Asks) -> LeaseGranted:
+    def acquire(body: LeaseBody, here: Here, requested: Requested) -> LeaseGranted:
         leases = here.service.leases
-        return _granted(leases, leases.acquire(asked.caller, **_terms(body)))
+        return _granted(leases, leases.acquire(requested.caller, **_terms(body)))
 
     @command(
         app,
         "POST /lease/renew",
         LEASE_RENEW,
         "Have the lease run for its time from now on",
-        recorded=lambda asked, body, **_: {"for_s": None if body is None else body.for_s, **_which(asked)},
+        recorded=lambda requested, body, **_: {
+            "for_s": None if body is None else body.for_s,
+            **_which(requested),
+        },
     )
-    def renew(here: Here, asked: Asks, body: RenewBody | None = None) -> LeaseGranted:
+    def renew(here: Here, requested: Requested, body: RenewBody | None = None) -> LeaseGranted:
         leases = here.service.leases
-        return _granted(leases, leases.renew(_lease_of(asked), None if body is None else body.for_s))
+        return _granted(leases, leases.renew(_lease_of(requested), None if body is None else body.for_s))
 
     @command(
-        app, "DELETE /lease", LEASE_RELEASE, "Release the lease", recorded=lambda asked, **_: _which(asked)
+        app,
+        "DELETE /lease",
+        LEASE_RELEASE,
+        "Release the lease",
+        recorded=lambda requested, **_: _which(requested),
     )
-    def release(here: Here, asked: Asks) -> LeaseTold:
+    def release(here: Here, requested: Requested) -> LeaseTold:
         leases = here.service.leases
-        leases.release(_lease_of(asked))
+        leases.release(_lease_of(requested))
         return {"control": leases.as_json()}
 
     @command(
         app, "POST /lease/take", LEASE_TAKE, "Take the lease from its holder; what runs under it is stopped"
     )
-    def take(body: TakeBody, here: Here, asked: Asks) -> LeaseGranted:
+    def take(body: TakeBody, here: Here, requested: Requested) -> LeaseGranted:
         leases = here.service.leases
-        return _granted(leases, leases.take(asked.caller, body.reason, **_terms(body)))
+        return _granted(leases, leases.take(requested.caller, body.reason, **_terms(body)))
 
 
 def _terms(body: LeaseBody) -> dict[str, Any]:
@@ -327,14 +336,14 @@ def _granted(leases: LeaseTable, lease: Lease) -> LeaseGranted:
     return {"lease_id": lease.id, **leases.lease_as_json(lease)}
 
 
-def _which(asked: CommandRequest) -> dict[str, str]:
+def _which(requested: CommandRequest) -> dict[str, str]:
     """What tells a lease from another in the record, without being it: a key that came with one is not good
     for the next."""
-    return {"of": hashlib.sha256(_lease_of(asked).encode()).hexdigest()[:16]}
+    return {"of": hashlib.sha256(_lease_of(requested).encode()).hexdigest()[:16]}
 
 
-def _lease_of(asked: CommandRequest) -> str:
+def _lease_of(requested: CommandRequest) -> str:
     """The lease that a request speaks of. Raises BadRequest."""
-    if asked.lease is None:
+    if requested.lease is None:
         raise BadRequest("bad_request", "Mastctl-Lease is missing; the id of the lease is expected")
-    return asked.lease
+    return requested.lease
