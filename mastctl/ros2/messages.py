@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TransformStamped, Vector3Stamped
-from sensor_msgs.msg import CameraInfo, CompressedImage, JointState
+from sensor_msgs.msg import CameraInfo
 from std_msgs.msg import Header
 
 from calib.geometry.cahvor import CameraModel
@@ -26,13 +25,6 @@ LEVELS = {"fault": ERROR} | dict.fromkeys(("stopped", "stopping", "holding", "st
 def stamp(ns: int) -> Time:
     """Return nanoseconds since 1970 as ROS has them."""
     return Time(sec=ns // NS, nanosec=ns % NS)
-
-
-def joint_state(names: RosNames, at_ns: int, pan_rad: float, tilt_rad: float) -> JointState:
-    """Return the joints as the head reads them, radians."""
-    return JointState(
-        header=Header(stamp=stamp(at_ns)), name=[names.pan, names.tilt], position=[pan_rad, tilt_rad]
-    )
 
 
 def moving_transforms(
@@ -96,13 +88,6 @@ def camera_info(lens: str, camera: CameraModel) -> CameraInfo:
         r=np.eye(3).ravel().tolist(),
         p=np.hstack([camera.camera_matrix, np.zeros((3, 1))]).ravel().tolist(),
     )
-
-
-def image(header: Header, jpeg: bytes) -> CompressedImage:
-    """Return a camera's JPEG."""
-    return CompressedImage(
-        header=header, format="jpeg", data=array("B", jpeg)
-    )  # bytes are checked one by one
 
 
 def residual(header: Header, pixels: Sequence[float | None]) -> Vector3Stamped:

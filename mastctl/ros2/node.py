@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from array import array
 from collections import deque
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
@@ -220,7 +221,11 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         if at_ns is None or rig is None:
             return
         self._joint_states.publish(
-            messages.joint_state(self.names, at_ns, joints["pan_rad"], joints["tilt_rad"])
+            JointState(
+                header=Header(stamp=messages.stamp(at_ns)),
+                name=[self.names.pan, self.names.tilt],
+                position=[joints["pan_rad"], joints["tilt_rad"]],
+            )
         )
         true_rad = joints["true_pan_rad"], joints["true_tilt_rad"]
         self._publish_transforms(messages.moving_transforms(self.names, rig, at_ns, *true_rad), False)
@@ -248,7 +253,8 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         self.state.put_image(camera, at_ns, facts["frame_id"])
         image, info = self._images[camera]
         header = Header(stamp=messages.stamp(at_ns), frame_id=self.names.optical(camera))
-        image.publish(messages.image(header, picture.jpeg))
+        jpeg = array("B", picture.jpeg)  # bytes are checked one by one
+        image.publish(CompressedImage(header=header, format="jpeg", data=jpeg))
         if camera in self._infos:
             self._infos[camera].header = header
             info.publish(self._infos[camera])

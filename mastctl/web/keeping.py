@@ -175,7 +175,7 @@ def add_bench(app: FastAPI) -> None:
         bench = here.service.bench
         return {"run": bench.start(requested.caller.name, requested.last_stop, **body.model_dump())}
 
-    @command(app, "POST /bench/stands", BENCH_STANDS, "Say that the board stands where it was asked for")
+    @command(app, "POST /bench/stands", BENCH_STANDS, "Confirm that the board stands where it is requested")
     def stands(here: Here) -> BenchAnswer:
         return {"run": here.service.bench.stands()}
 
