@@ -12,7 +12,7 @@ library as published with VICAR (``cmod_cahv*.c``).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from math import inf, isfinite, sqrt
 from numbers import Integral
 from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from calib.geometry.lenses import Lens, Projection
 from calib.geometry.lenses.opencv import OpencvLens
 from calib.geometry.lenses.round import RoundLens
-from calib.geometry.rigid import FloatArray, ReadOnlyArrays, Rigid, frozen_array, tangents, turning
+from calib.geometry.rigid import FloatArray, ReadOnlyArrays, Rigid, frozen_array, tangents
 
 Kind = Literal[
     "CAHV",
@@ -305,26 +305,6 @@ class CameraModel(ReadOnlyArrays):
         letters = {"C": rows[0], "H": rows[1], "V": rows[2], "A": rows[3], "O": rows[6]}
         model.__dict__.update(self.__dict__, _rows=rows, **letters)
         return model
-
-    def turned(self, turn_rad: ArrayLike) -> CameraModel:
-        """Return the camera turned about its C by a rotation vector (3,), radians."""
-        rotation = turning(np.asarray(turn_rad, dtype=np.float64))
-        return self.moved(Rigid(rotation, self.C - rotation @ self.C))
-
-    def zoomed(self, part: float) -> CameraModel:
-        """Return the camera with a focal length longer by a part of itself."""
-        h, v = (letter + part * (letter - (letter @ self.A) * self.A) for letter in (self.H, self.V))
-        return replace(self, H=h, V=v)
-
-    def bent(self, place: int, by: float) -> CameraModel:
-        """Return the camera whose lens bends otherwise: R1 or R2, OpenCV's k1 or k2, larger by ``by``.
-
-        ``place`` is 0 for the term that grows with the square of the slope, 1 for that of its fourth power.
-        A CAHV camera stays what it is.
-        """
-        if self.kind in FREE:
-            return replace(self, distortion=self.distortion + by * np.eye(len(self.distortion))[place])
-        return replace(self, R=self.R + by * np.eye(3)[place + 1])
 
     @property
     def focal_px(self) -> tuple[float, float]:

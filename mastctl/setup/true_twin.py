@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from calib.geometry.cahvor import CameraModel
+from calib.geometry.cahvor import FREE, CameraModel
 from calib.geometry.covariance import RigCovariance, moved_rig, stored_covariance
 from calib.geometry.parameters import parameter_names, parameter_part
 from calib.geometry.rig import JointErrors, Rig
@@ -119,7 +119,10 @@ def _errors(model: CameraModel) -> list[Callable[[float], CameraModel]]:
         return replace(model, H=h, V=v)
 
     def bent(place: int) -> Callable[[float], CameraModel]:
-        return lambda t: model.bent(place, t * LEFT_BENDS[place])
+        if model.kind in FREE:
+            rate = LEFT_BENDS[place] * np.eye(len(model.distortion))[place]
+            return lambda t: replace(model, distortion=model.distortion + t * rate)
+        return lambda t: replace(model, R=model.R + t * LEFT_BENDS[place] * np.eye(3)[place + 1])
 
     found = [shifted(axis) for axis in range(3)] + [turned(turn) for turn in (rot_x, rot_y, rot_z)] + [zoomed]
     found += [

@@ -11,6 +11,7 @@ import pytest
 
 from calib.errors import BadFile
 from calib.files.mast_file import load_rig, save_rig
+from calib.geometry.rigid import Rigid, rot_x
 
 TEXT = """schema: mastctl/mast/1
 name: bench
@@ -48,7 +49,7 @@ def test_the_keys_are_opencvs_numbers(tmp_path: Path) -> None:
 
 def test_a_file_read_and_written_is_the_same_to_the_last_bit(tmp_path: Path) -> None:
     first = save_rig(load_rig(written(tmp_path, TEXT)).rig, tmp_path / "one.yaml")
-    turned = first.rig.cameras["navcam"].model.turned([0.1, 0.2, 0.3])
+    turned = first.rig.cameras["navcam"].model.moved(Rigid(rot_x(0.3), np.zeros(3)))
     assert np.abs(turned.rotation @ turned.rotation.T - np.eye(3)).max() < 1e-15
     assert save_rig(load_rig(tmp_path / "one.yaml").rig, tmp_path / "two.yaml").digest == first.digest
 
