@@ -149,21 +149,16 @@ _HEAD_NAMES = (*_MAST, *JOINT_NAMES, *JOINTS_NAMES)
 """What moves a head."""
 
 
-class CameraRates(NamedTuple):
-    """Pixels (n, 2) of points, d pixel / d step of the camera (2, s, n), and d pixel / d motion (2, 6, n) of
-    all points: a turn about the origin of the frame that the camera is in, and a shift."""
+def camera_rates(model: CameraModel, points_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return pixels (n, 2) of points (n, 3), in the frame that a camera is in, and what they depend on.
 
-    pixels_px: FloatArray
-    to_step: FloatArray
-    to_motion: FloatArray
-
-
-def camera_rates(model: CameraModel, points_m: FloatArray) -> CameraRates:
-    """Return pixels of points (n, 3), in the frame that a camera is in, and what they depend on."""
+    First the camera's step (2, s, n), then a motion (2, 6, n) of all points: a turn about the origin of that
+    frame, and a shift.
+    """
     seen = predict(model, points_m)
     by_point = seen.d_points.transpose(1, 2, 0)
     by_motion = np.concatenate([crossed_rows(points_m.T, by_point), by_point], axis=1)
-    return CameraRates(seen.pixels_px, seen.d_step.transpose(1, 2, 0), by_motion)
+    return seen.pixels_px, seen.d_step.transpose(1, 2, 0), by_motion
 
 
 class PixelRates(NamedTuple):
@@ -193,23 +188,24 @@ def pixel_rates(
     at = {name: i for i, name in enumerate(names)}
     out = np.zeros((2, len(names), len(points_m)))
     if mounted.on == "rover":
-        seen = camera_rates(mounted.model, points_m)
-        to_points = seen.to_motion[:, 3:].transpose(2, 0, 1)
+        pixels_px, by_step, by_motion = camera_rates(mounted.model, points_m)
+        to_points = by_motion[:, 3:].transpose(2, 0, 1)
     else:
         head = gimbal(numbers_of(rig.mast), pan_rad, tilt_rad)
-        seen = camera_rates(mounted.model, (points_m - head.translation_m) @ head.rotation)
-        to_points = seen.to_motion[:, 3:].transpose(2, 0, 1) @ head.rotation.T
+        in_head = (points_m - head.translation_m) @ head.rotation
+        pixels_px, by_step, by_motion = camera_rates(mounted.model, in_head)
+        to_points = by_motion[:, 3:].transpose(2, 0, 1) @ head.rotation.T
         twists = head.twists
         if any(name in at for name in JOINTS_NAMES):
             read_rad = rig.joints.read_rad((pan_rad, tilt_rad), approach)
             twists = np.concatenate([twists, joint_twists(head, rig.joints, read_rad, approach)[:-2]])
         free = [i for i, name in enumerate(_HEAD_NAMES) if name in at]
         # The head carries the camera: points move the other way before it.
-        out[:, [at[_HEAD_NAMES[i]] for i in free]] = -head.in_head(twists[free]) @ seen.to_motion
+        out[:, [at[_HEAD_NAMES[i]] for i in free]] = -head.in_head(twists[free]) @ by_motion
     mine = [f"cameras.{camera}.{part}" for part in parameter_names(mounted.model.kind)]
     known = [i for i, name in enumerate(mine) if name in at]
-    out[:, [at[mine[i]] for i in known]] = seen.to_step[:, known]
-    return PixelRates(seen.pixels_px, out.transpose(2, 0, 1), to_points)
+    out[:, [at[mine[i]] for i in known]] = by_step[:, known]
+    return PixelRates(pixels_px, out.transpose(2, 0, 1), to_points)
 
 
 def click_rates(
@@ -269,13 +265,6 @@ def _unknown(cameras: Sequence[str], calibration: RigCovariance | None) -> list[
     return [one for one in cameras if not any(name.startswith(f"cameras.{one}.") for name in names)]
 
 
-class PlaceRates(NamedTuple):
-    """How the place (3,) of a point depends on its clicks in k cameras (3, 2k) and on parameters (3, p)."""
-
-    to_clicks: FloatArray
-    to_rig: FloatArray
-
-
 def place_rates(
     rig: Rig,
     names: Sequence[str],
@@ -284,8 +273,9 @@ def place_rates(
     tilt_rad: float,
     position_m: FloatArray,
     approach: Approach = UNKNOWN,
-) -> PlaceRates:
-    """Return how a point (3,) that a stereo pair shows, or one camera that is given the range, would move.
+) -> tuple[FloatArray, FloatArray]:
+    """Return how a point (3,) that a stereo pair shows, or one camera that is given the range, would move:
+    with its clicks in k cameras (3, 2k), and with parameters (3, p).
 
     Raises CalibError if a camera does not see the point.
     """
@@ -301,7 +291,7 @@ def place_rates(
     else:
         left_px, right_px = (one.pixels_px[0] for one in seen)
         to_clicks = triangulate(models[0], models[1], left_px, right_px).rates_m_per_px
-    return PlaceRates(to_clicks, -to_clicks @ np.concatenate([one.to_rig[0] for one in seen]))
+    return to_clicks, -to_clicks @ np.concatenate([one.to_rig[0] for one in seen])
 
 
 def landing_rates(
@@ -323,14 +313,14 @@ def landing_rates(
     CalibError if a camera does not see the target, or it cannot be pointed at.
     """
     every, size = (*names, *JOINT_NAMES), len(names)
-    place = place_rates(rig, every, cameras, pan_rad, tilt_rad, target_m, approaches[0])
+    _, place_by_rig = place_rates(rig, every, cameras, pan_rad, tilt_rad, target_m, approaches[0])
     camera, model = cameras[0], rig.cameras[cameras[0]].model
     at = solve(rig.mast, model, target_m, from_pan_rad=pan_rad, from_tilt_rad=tilt_rad)[0]
     landed = pixel_rates(rig, every, camera, at.pan_rad, at.tilt_rad, target_m[None], approaches[1])
     by_place, by_rig = landed.to_points[0], landed.to_rig[0]
     if not np.isfinite(by_rig).all():
         raise CalibError(f"camera {camera} does not see the target where it should land")
-    clicking = by_place @ place.to_rig
+    clicking = by_place @ place_by_rig
     to_readings = np.hstack([clicking[:, size:], by_rig[:, size:]])
     return -(by_rig[:, :size] + clicking[:, :size]), -to_readings
 

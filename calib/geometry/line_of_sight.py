@@ -118,7 +118,7 @@ def seen_from(
     _, direction = _ray(rig, sight)
     place_m = sight.position_m(rig)
     try:
-        place = place_rates(rig, names, (sight.camera,), *sight.joints_rad, place_m)
+        by_click, by_source = place_rates(rig, names, (sight.camera,), *sight.joints_rad, place_m)
         view = pixel_rates(rig, names, camera, *joints_rad, place_m[None])
         if not np.isfinite(view.pixels_px).all():
             raise CalibError
@@ -127,10 +127,10 @@ def seen_from(
         raise CalibError(message) from None
     by_place, by_rig = view.to_points[0], view.to_rig[0]
     along = -(sight.range_m**2) * (by_place @ direction)
-    clicked = sigma_px * (by_place @ place.to_clicks)
+    clicked = sigma_px * (by_place @ by_click)
     covariance = clicked @ clicked.T
     if camera != sight.camera or joints_rad != sight.joints_rad:
-        first = by_place @ place.to_rig
+        first = by_place @ by_source
         turned = np.hstack([first[:, size:], by_rig[:, size:]]) * np.tile(sigma_rad, 2)
         both = first[:, :size] + by_rig[:, :size]
         covariance += turned @ turned.T + both @ known.covariance @ both.T
