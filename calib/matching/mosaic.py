@@ -38,7 +38,7 @@ GREYS = (8.0, 247.0)
 PATCHES_A_SEAM = 6
 SEARCH_PX = 16.0
 MATCH = MatchSettings(roughness=0.0)
-RELIEF_PER_M = 0.1
+RELIEF_PER_M = 0.5
 """One sigma of what the scene's inverse range may differ from the surface by, for the test of slips."""
 STEP_RAD = 1e-4
 LEAST_SLIP_RAD = 1e-4

@@ -18,17 +18,18 @@ from typing import Any
 
 import numpy as np
 
-from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
 from drivers.sim.rover import RoverModel
 from mastctl.cli.experiment import results_of
 from mastctl.client import Client
 from mastctl.daemon import RunningDaemon
+from mastctl.errors import MastctlError
 from mastctl.panorama.compose import picture_at
 from mastctl.panorama.folder import Folder
 from tools.campaigns.residuals import FAR_M, LEFT, NEAR_M, RIGHT, TrueClick, config_of, hit, shown, summary
 from tools.command import end, options, show
 
+Angles = dict[int, tuple[float, float]]
 A_SCENE = 20
 FIELD: dict[str, Any] = {"pan_rad": (-1.1, 1.1), "tilt_rad": (-0.75, -0.1)}
 SLIP_RAD = 1e-3
@@ -65,7 +66,8 @@ def found_in(task: Scene) -> Found:
             folder = taken(client, Path(state))
             assert folder.index.whole is not None
             seams = (*folder.index.whole.rms_px, *folder.index.whole.across_px)
-            clicks = [click(client, rover, folder, rng) for _ in range(task.cases)]
+            true = true_angles(folder, rover)  # the simulator forgets them
+            clicks = [click(client, rover, folder, true, rng) for _ in range(task.cases)]
             slips = [slipped(client, folder, rover, axis) for axis in (0, 1)] if task.number == 0 else []
     return Found(clicks, seams, slips)
 
@@ -77,37 +79,17 @@ def taken(client: Client, state: Path) -> Folder:
     return Folder(state / "panoramas" / str(record["request"]["panorama"]))
 
 
-def true_camera(rover: RoverModel, folder: Folder, view: int) -> CameraModel:
-    """The camera of a view in the rover frame as it truly stood."""
-    at_s = folder.index.views[view].frames[LEFT].mid_exposure_s
-    return rover.rig.camera_in_rover(LEFT, *rover.true_joints(at_s))
+def true_angles(folder: Folder, rover: RoverModel) -> dict[int, tuple[float, float]]:
+    """Where the joints truly stood at each view, by its number."""
+    return {at: rover.true_joints(view.frames[LEFT].mid_exposure_s) for at, view in folder.index.taken()}
 
 
-def random_pixel(
-    folder: Folder, rover: RoverModel, rng: np.random.Generator
-) -> tuple[tuple[float, float], FloatArray]:
-    """A random pixel of the mosaic that shows something in range, and that point in the rover frame."""
-    assert folder.index.mosaic is not None
-    while True:
-        x, y = (float(rng.uniform(0, side - 1)) for side in folder.index.mosaic.size_px)
-        try:
-            seen = picture_at(folder, (x, y))
-        except Exception as error:  # no view shows it
-            if getattr(error, "code", "") != "outside_panorama":
-                raise
-            continue
-        camera = true_camera(rover, folder, seen.view)
-        point = hit(rover, camera, seen.pixel_px[None])[0]
-        if NEAR_M <= float(np.linalg.norm(point - camera.C)) <= FAR_M:
-            return (x, y), point
-
-
-def click(client: Client, rover: RoverModel, folder: Folder, rng: np.random.Generator) -> TrueClick:
+def click(
+    client: Client, rover: RoverModel, folder: Folder, true: Angles, rng: np.random.Generator
+) -> TrueClick:
     """Point once at a random pixel of the mosaic, and hold the residual against the truth."""
-    (x, y), point = random_pixel(folder, rover, rng)
-    seen = picture_at(folder, (x, y))
-    joints = rover.true_joints(folder.index.views[seen.view].frames[LEFT].mid_exposure_s)
-    hidden = not shown(rover, rover.rig.camera_in_rover(RIGHT, *joints), point)
+    (x, y), view, point = random_pixel(folder, rover, true, rng)
+    hidden = not shown(rover, rover.rig.camera_in_rover(RIGHT, *true[view]), point)
     target = {"id": folder.index.id, "x_px": x, "y_px": y}
     record: Any = client.wait(client.point(panorama=target), timeout_s=WAITED_S)
     if record["state"] != "done":
@@ -117,6 +99,23 @@ def click(client: Client, rover: RoverModel, folder: Folder, rng: np.random.Gene
     now = rover.rig.camera_in_rover(LEFT, *rover.true_joints(landed.mid_exposure_s))
     error_px = np.array(row["target_px"]) - now.project(point)[0]
     return TrueClick(hidden, "", (error_px[0], error_px[1]), tuple(row["residual_sigma_px"]))
+
+
+def random_pixel(
+    folder: Folder, rover: RoverModel, true: Angles, rng: np.random.Generator
+) -> tuple[tuple[float, float], int, FloatArray]:
+    """A random pixel of the mosaic that shows something in range, its view, and that point (rover frame)."""
+    assert folder.index.mosaic is not None
+    while True:
+        x, y = (float(rng.uniform(0, side - 1)) for side in folder.index.mosaic.size_px)
+        try:
+            seen = picture_at(folder, (x, y))
+        except MastctlError:  # no view shows it
+            continue
+        camera = rover.rig.camera_in_rover(LEFT, *true[seen.view])
+        point = hit(rover, camera, seen.pixel_px[None])[0]
+        if NEAR_M <= float(np.linalg.norm(point - camera.C)) <= FAR_M:
+            return (x, y), seen.view, point
 
 
 def slipped(client: Client, before: Folder, rover: RoverModel, axis: int) -> str:
