@@ -252,7 +252,8 @@ def _part(schema: dict[str, Any], steps: Sequence[int | str]) -> tuple[dict[str,
         schema = next((one for one in schema.get("anyOf", ()) if one.get("type") != "null"), schema)
         if step is None:
             break
-        kinds = [one["then"] for one in schema.get("allOf", ()) if _value_of(one) == step]
+        cases = [(one, *one["if"]["properties"].values()) for one in schema.get("allOf", ())]
+        kinds = [one["then"] for one, value in cases if value["const"] == step]  # as `when` writes them
         if kinds and step not in schema["properties"]:
             schema = kinds[0]
             continue
@@ -263,11 +264,6 @@ def _part(schema: dict[str, Any], steps: Sequence[int | str]) -> tuple[dict[str,
         else:
             schema = schema.get("properties", {}).get(step) or schema.get("additionalProperties") or {}
     return schema, place
-
-
-def _value_of(case: dict[str, Any]) -> object:
-    """The value that a case of `when` is for."""
-    return next(iter(case["if"]["properties"].values()))["const"]
 
 
 def _expected(schema: dict[str, Any], value: object) -> str:

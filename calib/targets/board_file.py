@@ -107,10 +107,8 @@ class _BoardRecord(Record, json_schema_extra={"dependentRequired": {"measured": 
         if self.bar_m is None:
             reason = "there is no bar_m; a measured length says nothing without the one drawn"
             raise problem("measured", reason)
-        aspect, scale = (
-            board.aspect,
-            _scale("across_m", self.measured.across_m, self.bar_m.across, WORST_SCALE),
-        )
+        aspect = board.aspect
+        scale = _scale("across_m", self.measured.across_m, self.bar_m.across, WORST_SCALE)
         if self.measured.down_m is not None:
             aspect *= _scale("down_m", self.measured.down_m, self.bar_m.down * scale, WORST_ASPECT)
         lengths = {key: scale * getattr(board, key) for key in vars(board) if key.endswith("_m")}
