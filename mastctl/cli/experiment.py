@@ -47,12 +47,12 @@ TASKS = Group(
 SEED = option("--seed SEED", "chooses views and pixels", default=1)
 
 
-def study_of(words: Sequence[str]) -> tuple[str, list[str]] | None:
+def study_of(argv: Sequence[str]) -> tuple[str, list[str]] | None:
     """Return the study that a command line names, and its own options; None if it names none."""
-    plain = [at for at, word in enumerate(words) if not word.startswith("-")][:2]
-    if len(plain) < 2 or words[plain[0]] != "experiment" or words[plain[1]] not in STUDIES:
+    plain = [at for at, one in enumerate(argv) if not one.startswith("-")][:2]
+    if len(plain) < 2 or argv[plain[0]] != "experiment" or argv[plain[1]] not in STUDIES:
         return None
-    return words[plain[1]], [word for at, word in enumerate(words) if at not in plain]
+    return argv[plain[1]], [one for at, one in enumerate(argv) if at not in plain]
 
 
 def become_study(name: str, options: Sequence[str]) -> NoReturn:

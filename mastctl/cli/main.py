@@ -77,7 +77,7 @@ EVERYWHERE = {
     "--version": "print the version",
     "--print-completion SHELL": "for bash, zsh or tcsh",
 }
-COMMANDS = {words: entry for commands in OVERVIEW.values() for words, entry in commands.items()}
+COMMANDS = {name: entry for commands in OVERVIEW.values() for name, entry in commands.items()}
 
 
 class _Overview(Parser):
@@ -87,8 +87,8 @@ class _Overview(Parser):
         """Return the usage, and the commands and options in one screen."""
         lines = [self.format_usage().rstrip(), ""]
         for heading, commands in OVERVIEW.items():
-            shown = ((words, help) for words, (_, help) in commands.items() if help)
-            lines += [f"{heading}:", *(f"  {words:<12} {help}" for words, help in shown)]
+            shown = ((name, help) for name, (_, help) in commands.items() if help)
+            lines += [f"{heading}:", *(f"  {name:<12} {help}" for name, help in shown)]
         lines += ["", *(f"{name:<25} {help}" for name, help in EVERYWHERE.items()), ""]
         return "\n".join(lines)
 
@@ -108,42 +108,42 @@ class _Version(argparse.Action):
 
 def build_parser(wanted: str | None = None) -> Parser:
     """Return the parser of all commands, or of those whose first word is ``wanted``."""
-    chosen = {words: entry for words, entry in COMMANDS.items() if wanted in (None, words)}
+    chosen = {name: entry for name, entry in COMMANDS.items() if wanted in (None, name)}
     for modules, _ in chosen.values():
         for module in modules.split():
             importlib.import_module(f"mastctl.cli.{module}")
     parser = _Overview(prog="mastctl", usage="mastctl [-h] [--version] COMMAND ...")
     parser.add_argument("--version", action=_Version)
     inner = {"": parser.add_subparsers(parser_class=Parser, prog="mastctl", metavar="COMMAND", required=True)}
-    for words in chosen:
-        if words not in DECLARED:
-            _group(inner, words, COMMANDS[words][1])
-    for words, one in DECLARED.items():
-        if words in chosen or words.split()[0] in chosen:
+    for name in chosen:
+        if name not in DECLARED:
+            _group(inner, name, COMMANDS[name][1])
+    for name, one in DECLARED.items():
+        if name in chosen or name.split()[0] in chosen:
             _add(inner, one)
     return parser
 
 
-def _group(inner: dict[str, Any], words: str, help: str) -> None:
+def _group(inner: dict[str, Any], name: str, help: str) -> None:
     """Add a command that has commands."""
-    above, _, name = words.rpartition(" ")
-    made = inner[above].add_parser(name, help=help, description=_sentence(help))
-    inner[words] = made.add_subparsers(
-        parser_class=Parser, prog=f"mastctl {words}", metavar="COMMAND", required=True
+    above, _, last = name.rpartition(" ")
+    made = inner[above].add_parser(last, help=help, description=_sentence(help))
+    inner[name] = made.add_subparsers(
+        parser_class=Parser, prog=f"mastctl {name}", metavar="COMMAND", required=True
     )
 
 
 def _add(inner: dict[str, Any], one: CommandLine) -> None:
     """Add a command that does something; one below another such is joined with it, as ``calibrate bench``."""
-    above, _, name = one.words.rpartition(" ")
-    if one.words in COMMANDS:
-        above, name = "", one.words
+    above, _, last = one.name.rpartition(" ")
+    if one.name in COMMANDS:
+        above, last = "", one.name
     elif above not in inner:
         _group(inner, above, GROUPS[above])
-    help = one.help or COMMANDS[one.words][1]
+    help = one.help or COMMANDS[one.name][1]
     made = inner[above].add_parser(
-        name, help=help, description=one.about or _sentence(help),
-        epilog=f"example: mastctl {one.words} {one.example}".rstrip().replace("%", "%%"),
+        last, help=help, description=one.about or _sentence(help),
+        epilog=f"example: mastctl {one.name} {one.example}".rstrip().replace("%", "%%"),
     )  # fmt: skip
     add_options(made, *one.options)
     made.set_defaults(run=one.run)
@@ -174,19 +174,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command (``argv``: what follows ``mastctl``) and return its exit code; never raises."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
-        if stream is None:  # closed by whoever started us (>&-): then nobody reads
+        if stream is None:  # closed by the caller (>&-): nothing reads it
             setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115, PTH123  for as long as the process
         elif isinstance(stream, io.TextIOWrapper):
             # What the terminal's encoding, or none, can hold (a tick mark, a file's name) is escaped.
             stream.reconfigure(errors="backslashreplace")
-    words = list(sys.argv[1:] if argv is None else argv)
+    argv = list(sys.argv[1:] if argv is None else argv)
     if not logging.getLogger().handlers:
         # Through a queue: the logs of a driver or a daemon in this process never wait for a reader.
         handler = QueuedHandler(writer_to(sys.stderr.fileno()))
         logging.basicConfig(format=TEXT, level=logging.WARNING, handlers=[handler])
     try:
         with signals.raised():
-            code = _finish(words, "--json" in words)
+            code = _finish(argv, "--json" in argv)
         sys.stdout.flush()
     except OSError as error:
         # The reader of stdout is gone (head, less), or its disk is full.
@@ -195,11 +195,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     return code
 
 
-def _finish(words: Sequence[str], as_json: bool) -> int:
+def _finish(argv: Sequence[str], as_json: bool) -> int:
     """Run, and turn what is raised into one line and an exit code; only a broken stdout gets out."""
     refusal: BaseException
     try:
-        return _run(words)
+        return _run(argv)
     except BrokenPipeError:
         raise
     except KeyboardInterrupt as interrupt:
@@ -220,20 +220,20 @@ def _give_up_stdout() -> None:
     os.close(null)
 
 
-def _run(words: Sequence[str]) -> int:
+def _run(argv: Sequence[str]) -> int:
     """Parse and run; --help and --version end here with their own code."""
     try:
-        if words and words[0].startswith("--print-completion"):
+        if argv and argv[0].startswith("--print-completion"):
             parser = _completing()
         else:
-            words, command = _joined(words)
+            argv, command = _joined(argv)
             if command == "experiment":
                 from mastctl.cli.experiment import become_study, study_of
 
-                if (study := study_of(words)) is not None:
+                if (study := study_of(argv)) is not None:
                     become_study(*study)
             parser = build_parser(command)
-        args = parser.parse_args(words)
+        args = parser.parse_args(argv)
     except SystemExit as done:
         return int(done.code or 0)
     args.json = getattr(args, "json", False)
@@ -241,17 +241,17 @@ def _run(words: Sequence[str]) -> int:
     return output.show(args, answer) if isinstance(answer, output.Answer) else int(answer)
 
 
-def _joined(words: Sequence[str]) -> tuple[list[str], str]:
-    """Return the words with a leading --url last and a command of two words as one, and the command.
+def _joined(argv: Sequence[str]) -> tuple[list[str], str]:
+    """Return the arguments with a leading --url last and a command of two words as one, and the command.
 
     Raises WrongUse for an unknown command, with the nearest known one; argparse would list them all.
     """
-    if words and words[0].split("=")[0] == "--url":
-        size = 2 if words[0] == "--url" else 1
-        words = [*words[size:], *words[:size]]
-    if not words or words[0].startswith("-"):
-        return list(words), ""
-    command, *rest = words
+    if argv and argv[0].split("=")[0] == "--url":
+        size = 2 if argv[0] == "--url" else 1
+        argv = [*argv[size:], *argv[:size]]
+    if not argv or argv[0].startswith("-"):
+        return list(argv), ""
+    command, *rest = argv
     if command not in COMMANDS:
         near = get_close_matches(command, COMMANDS, n=1)
         hint = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(COMMANDS)}"
@@ -264,7 +264,7 @@ def _joined(words: Sequence[str]) -> tuple[list[str], str]:
 def _moved(command: str) -> str:
     """A command of this name below another one, as a hint."""
     build_parser()
-    below = [words for words in (*GROUPS, *DECLARED) if words.split()[1:2] == [command]]
+    below = [name for name in (*GROUPS, *DECLARED) if name.split()[1:2] == [command]]
     return f"did you mean '{below[0]}'?" if below else ""
 
 

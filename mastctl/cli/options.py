@@ -163,9 +163,9 @@ def _reader(values: list[str]) -> Callable[[str], Any]:
 
 
 class CommandLine(NamedTuple):
-    """A command: its words after ``mastctl``, what it does, its options and an example of them."""
+    """A command: its name after ``mastctl``, what it does, its options and an example of them."""
 
-    words: str
+    name: str
     help: str
     options: tuple[Option | Group, ...]
     example: str
@@ -174,14 +174,14 @@ class CommandLine(NamedTuple):
 
 
 DECLARED: dict[str, CommandLine] = {}
-"""Every command of the modules that are imported, by its words."""
+"""Every command of the modules that are imported, by its name."""
 
 GROUPS: dict[str, str] = {}
-"""What the groups of their commands are for, by their words."""
+"""What the groups of their commands are for, by their names."""
 
 
 def command(
-    words: str, *options: Option | Group, help: str = "", example: str = "", about: str = ""
+    name: str, *options: Option | Group, help: str = "", example: str = "", about: str = ""
 ) -> Callable[[Run], Run]:
     """Return a decorator that makes a function a command.
 
@@ -191,7 +191,7 @@ def command(
     """
 
     def declare(run: Run) -> Run:
-        DECLARED[words] = CommandLine(words, help, options, example, about, run)
+        DECLARED[name] = CommandLine(name, help, options, example, about, run)
         return run
 
     return declare

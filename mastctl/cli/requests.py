@@ -37,7 +37,7 @@ class Request(NamedTuple):
     People see ``line``, with keys of the answer in braces, or else its values at ``keys``, or all of it.
     """
 
-    words: str
+    name: str
     help: str
     send: Callable[[Client, argparse.Namespace], Mapping[str, Any]]
     options: tuple[Option, ...] = ()
@@ -213,7 +213,7 @@ REQUESTS = (
 )  # fmt: skip
 
 for _one in REQUESTS:
-    command(_one.words, *_one.options, *_one.daemon, help=_one.help, example=_one.example)(_one.run)
+    command(_one.name, *_one.options, *_one.daemon, help=_one.help, example=_one.example)(_one.run)
 
 
 TOKEN = (URL, CONFIG, option("--state FOLDER", "state folder of a daemon that does not run now"))

@@ -26,7 +26,7 @@ QUESTIONS: tuple[tuple[Any, ...], ...] = (
     ("pan_deg", "how far pan may turn, degrees", -85.0, 85.0),
     ("tilt_deg", "how far tilt may turn, degrees", -40.0, 30.0),
 )
-"""Options of ``rig new``, how a person is asked for them, and what is usual."""
+"""Options of ``rig new``, their questions to a person, and what is usual."""
 TWIN = "no head and no camera is plugged in: this is the simulated twin, which runs"
 
 
@@ -102,7 +102,7 @@ def _new(args: argparse.Namespace) -> Answer:
 
 
 def _numbers(args: argparse.Namespace) -> list[Any]:
-    """The numbers of the options; a person at a terminal is asked for the others, with the usual ones."""
+    """The numbers of the options; a person at a terminal answers for the others."""
     asks, found = not args.json and signals.can_ask(), []
     for name, question, *usual in QUESTIONS:
         given = getattr(args, name)

@@ -17,7 +17,7 @@ from mastctl.errors import MastctlError
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture with its words.
+    """A picture with its texts.
 
     ``source`` is what `data_url` returns. ``kind`` is ``photo``; ``lines``, which follow the page into the
     dark; or ``map``, whose colours mean numbers and stay.

@@ -21,7 +21,7 @@ Level = Literal["good", "unsure", "bad"]
 
 @dataclass(frozen=True)
 class DoctorFinding:
-    """One thing that was examined: ``what``, in two or three words, and ``advice`` if it is not good.
+    """One thing that was examined: ``what``, a short name, and ``advice`` if it is not good.
 
     ``unsure``: it works, but not as well or not for sure; ``bad``: the daemon will not work.
     """

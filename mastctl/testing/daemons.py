@@ -133,7 +133,7 @@ def config_for_a_test(
     if path is None:
         section.pop("samples", None)  # what the demo looks best with
     if "wire" in simulation:
-        section.pop("head", None)  # the wire's own, if none is asked for
+        section.pop("head", None)  # the wire's own, if none is requested
     section = {**USUAL, **section, **simulation}
     if section.get("wire") is not None and "speed" not in simulation:
         section["speed"] = 1
