@@ -38,7 +38,7 @@ SEEN = as_json(
         "aim": {"camera": "navcam_left", "x_px": 31.5, "y_px": 23.5}, "refused": None,
         "other_camera": "navcam_right", "other_frame_id": "b", "other_pixel_px": (30.0, 24.0),
         "other_sigma_px": (0.05, 0.05), "correlation": 0.97, "second": 0.4, "across_px": 0.02,
-        "sigma_m": (0.03, 0.01, 0.01), "range_sigma_m": 0.031,
+        "sigma_m": (0.03, 0.01, 0.01), "covariance_m2": None, "range_sigma_m": 0.031,
     }
 )  # fmt: skip
 
