@@ -84,18 +84,33 @@ def rot_z(angle_rad: float) -> FloatArray:
 
 
 def rotation_of(quaternion: ArrayLike) -> FloatArray:
-    """Return the rotation (3, 3) of a quaternion (w, x, y, z), whose length does not count."""
-    from scipy.spatial.transform import Rotation  # slow to load, and a daemon that starts does not need it
+    """Return the rotation (3, 3) of a quaternion (w, x, y, z), whose length does not count.
 
-    return np.asarray(Rotation.from_quat(np.roll(quaternion, -1)).as_matrix())
+    >>> rotation_of([1.0, 1.0, 1.0, 1.0]).tolist()  # a third of a turn: x becomes y, y becomes z
+    [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
+    """
+    numbers = np.asarray(quaternion, dtype=np.float64)
+    w, x, y, z = (numbers / math.sqrt(numbers @ numbers)).tolist()
+    turn = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + 2.0 * (w * turn + turn @ turn))
 
 
 def quaternion_of(rotation: FloatArray) -> list[float]:
-    """Return a rotation (3, 3) as its unit quaternion [w, x, y, z], w not negative."""
-    from scipy.spatial.transform import Rotation  # slow to load, and a daemon that starts does not need it
+    """Return a rotation (3, 3) as its unit quaternion [w, x, y, z], w not negative.
 
-    turn = Rotation.from_matrix(rotation).as_quat(canonical=True)
-    return [float(part) for part in np.roll(turn, 1)]
+    Four times q qᵀ is linear in the rotation; its row with the largest diagonal is the best conditioned
+    (S. W. Shepperd, Journal of Guidance and Control 1, 1978, 223).
+    """
+    (a, b, c), (d, e, f), (g, h, i) = rotation.tolist()
+    rows = (
+        (1.0 + a + e + i, h - f, c - g, d - b),
+        (h - f, 1.0 + a - e - i, b + d, c + g),
+        (c - g, b + d, 1.0 - a + e - i, f + h),
+        (d - b, c + g, f + h, 1.0 - a - e + i),
+    )
+    row = max(zip(range(4), rows, strict=True), key=lambda one: one[1][one[0]])[1]
+    length = -math.hypot(*row) if row[0] < 0.0 else math.hypot(*row)
+    return [part / length for part in row]
 
 
 def tangents(axis: FloatArray) -> FloatArray:

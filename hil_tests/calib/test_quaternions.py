@@ -1,24 +1,30 @@
-"""Quaternions worked by hand: the order of their parts, their length and their sign."""
+"""Quaternions beside SciPy's."""
 
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 
-from calib.geometry.rigid import quaternion_of, rot_x, rotation_of
+from calib.geometry.rigid import quaternion_of, rotation_of
 
 SAME = 1e-14
+HALF_TURNS = [[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0], [0.0, 0.6, -0.8, 0.0]]
 
 
-def test_a_third_of_a_turn_about_the_diagonal_makes_y_of_x_and_z_of_y() -> None:
-    turn = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
-    assert_allclose(rotation_of([3.0, 3.0, 3.0, 3.0]), turn, atol=SAME)
-    assert_allclose(quaternion_of(np.array(turn)), [0.5, 0.5, 0.5, 0.5], atol=SAME)
+def test_quaternions_are_those_of_scipy_at_every_turn() -> None:
+    seeded = Rotation.random(500, random_state=7)
+    near_half = np.random.default_rng(8).normal(size=(50, 3))
+    near_half *= (np.pi - 1e-9) / np.linalg.norm(near_half, axis=1, keepdims=True)
+    for turn in Rotation.concatenate([seeded, Rotation.from_rotvec(near_half), Rotation.identity(1)]):
+        assert_allclose(
+            quaternion_of(turn.as_matrix()), turn.as_quat(canonical=True, scalar_first=True), atol=SAME
+        )
+        assert_allclose(rotation_of(turn.as_quat(scalar_first=True)), turn.as_matrix(), atol=SAME)
 
 
-@pytest.mark.parametrize("angle_rad", [0.0, 0.3, -0.3, 3.0, -3.0, np.pi - 1e-9])
-def test_a_turn_about_x_has_half_the_angle_and_no_negative_w(angle_rad: float) -> None:
-    half = [np.cos(angle_rad / 2), np.sin(angle_rad / 2), 0.0, 0.0]
-    assert_allclose(quaternion_of(rot_x(angle_rad)), half, atol=SAME)
-    assert_allclose(rotation_of(np.negative(half)), rot_x(angle_rad), atol=SAME)
+def test_half_turns_and_lengths_come_back() -> None:
+    for quaternion in HALF_TURNS:
+        matrix = rotation_of(np.multiply(3.0, quaternion))
+        assert_allclose(matrix, Rotation.from_quat(quaternion, scalar_first=True).as_matrix(), atol=SAME)
+        assert_allclose(np.abs(np.dot(quaternion_of(matrix), quaternion)), 1.0, atol=SAME)
