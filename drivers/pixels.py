@@ -1,9 +1,9 @@
 """Formats of pictures: how many bytes there must be, the grey picture, and the colour picture.
 
 Formats of more than 8 bits keep their upper 8. Bayer formats are demosaiced by OpenCV; raw 16-bit words are
-little-endian with the value in the low bits, as the kernel and GenICam define them. Packed formats are of
-three kinds. In MIPI CSI-2 RAW10 and RAW12 the upper 8 bits of four or two samples stand first, then one byte
-with the rest of them all. GigE Vision puts the rests of two samples between them. GenICam's are one stream.
+little-endian with the value in the low bits, as the kernel and GenICam define them. Packed formats are MIPI
+CSI-2 RAW10 and RAW12: the upper 8 bits of four or two samples stand first, then one byte with the rest of
+them all. GenICam's own packed formats are not read: such a camera has an 8-bit format too.
 """
 
 from __future__ import annotations
@@ -44,7 +44,6 @@ class PictureFormat:
 
 
 Kind = Literal["grey", "bayer", "yuyv", "uyvy", "nv12", "jpeg", "rgb", "bgr"]
-Packing = Literal["mipi", "gige", "stream"]
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,6 @@ class Layout:
     bits: int = 8
     order: str = ""
     packed: int = 0
-    packing: Packing = "mipi"
 
 
 _ORDERS = ("BGGR", "GBRG", "GRBG", "RGGB")
@@ -112,9 +110,6 @@ def _genicam() -> dict[str, Layout]:
         kind: Kind = "bayer" if order else "grey"
         for bits in (8, 10, 12, 14, 16):
             found[f"{name}{bits}"] = Layout(kind, bits, order)
-        for bits, samples in ((10, 4), (12, 2)):
-            found[f"{name}{bits}p"] = Layout(kind, bits, order, samples, "stream")
-            found[f"{name}{bits}Packed"] = Layout(kind, bits, order, 2, "gige")
     return found
 
 
@@ -232,9 +227,6 @@ def _samples(format: PictureFormat, layout: Layout, raw: NDArray[np.uint8]) -> N
     width, height = format.size_px
     stride = _stride(format, _row_bytes(layout, width))
     rows = raw[: stride * height].reshape(height, stride)[:, : _row_bytes(layout, width)]
-    if layout.packing != "mipi":
-        groups = rows.reshape(height, -1, layout.packed + 1)
-        return np.ascontiguousarray(_upper(layout, groups).reshape(height, -1)[:, :width])
     if layout.packed:
         # The upper bytes of a group as one number: thirty times as fast as a slice of three dimensions.
         group = np.dtype([("upper", f"<u{layout.packed}"), ("rests", "u1")])
@@ -246,19 +238,6 @@ def _samples(format: PictureFormat, layout: Layout, raw: NDArray[np.uint8]) -> N
         return rows[:, 1::2].copy()
     words = rows.view("<u2") >> (layout.bits - 8)
     return _image(np.minimum(words, 255, out=words).astype(np.uint8))
-
-
-def _upper(layout: Layout, groups: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The upper 8 bits of the samples of packed groups, (h, groups, samples)."""
-    if layout.packing == "gige":
-        return groups[:, :, ::2]
-    upper = np.empty((*groups.shape[:2], layout.packed), np.uint8)
-    for index in range(layout.packed):
-        byte, shift = divmod(index * layout.bits + layout.bits - 8, 8)
-        upper[:, :, index] = groups[:, :, byte] >> shift
-        if shift:
-            upper[:, :, index] |= groups[:, :, byte + 1] << (8 - shift)
-    return upper
 
 
 def _decoded(format: PictureFormat, raw: NDArray[np.uint8], flags: int) -> Image:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -22,6 +23,95 @@ from drivers.clock import Clock, SystemClock
 from drivers.errors import BadOptions
 from drivers.faults import nearest
 from drivers.interfaces import Camera, PanTilt
+
+Ends = Mapping[str, tuple[float, float]]
+"""The ends of pan and tilt, radians."""
+
+
+class ProbedHead(ABC):
+    """A head that answered on a line.
+
+    ``usable``: whether it can be the head of a configuration.
+    """
+
+    driver: str
+    port: str
+    usable: bool = True
+    speed_rad_per_s: float = 0.5
+
+    @property
+    @abstractmethod
+    def summary(self) -> str:
+        """What it is, in one sentence."""
+
+    @abstractmethod
+    def configured(self, ends: Ends, ids: Mapping[str, int]) -> tuple[dict[str, Any], Ends]:
+        """Return its options without the port, and the ends that it can reach.
+
+        ``ids`` are those of the servos of pan and tilt.
+        """
+
+
+@dataclass(frozen=True)
+class ProbedCamera:
+    """A camera that has a format that is read.
+
+    ``node`` is its node now, which udev knows; None for a camera without one.
+    """
+
+    card: str
+    bus: str
+    node: Path | None
+    options: dict[str, Any]
+    driver: str
+
+    @property
+    def summary(self) -> str:
+        """What it is, in one sentence."""
+        width, height = self.options["size_px"]
+        return f"{self.card} at {self.bus}: {self.options['format']} {width}x{height}"
+
+
+@dataclass(frozen=True)
+class UnitBench:
+    """What is done with a pan/tilt unit on the bench.
+
+    Attributes
+    ----------
+    bauds
+        The rates of its line, the usual one first.
+    facts, home
+        ``facts(port, baud)`` returns what the unit reports; so does ``home``, after a reset.
+    """
+
+    bauds: Sequence[int]
+    facts: Callable[[str, int], Any]
+    home: Callable[[str, int], Any]
+
+
+@dataclass(frozen=True)
+class CameraBench:
+    """What is done with a camera that no daemon has.
+
+    Attributes
+    ----------
+    key, title
+        Of the table of connected cameras, in JSON and for people.
+    table
+        The connected cameras, each as column and text or list of texts, and a sentence for each that this
+        user may not open.
+    present
+        ``present(options, name)`` says which camera has answered; no stream is begun. Raises DriverError.
+    options_for
+        Options of a camera that a person names at the command line; None where only a configuration does.
+    """
+
+    key: str
+    title: str
+    table: Callable[[], tuple[list[dict[str, Any]], list[str]]]
+    present: Callable[[Mapping[str, Any], str], str]
+    options_for: Callable[..., dict[str, Any]] | None = None
+
 
 Kind = Literal["head", "camera"]
 GROUPS: Mapping[Kind, str] = MappingProxyType({"head": "mastctl.heads", "camera": "mastctl.cameras"})
@@ -75,13 +165,13 @@ class Driver:
         ``halt(options)`` stops a head that no daemon drives any more, and returns the actions on each axis in
         sentences. Raises DriverError if the head did not confirm.
     probe
-        Of a head: ``probe(port, path)`` returns the `drivers.probes.ProbedHead` on a line, or None, and a
+        Of a head: ``probe(port, path)`` returns the `ProbedHead` on a line, or None, and a
         reason that may be empty; DriverError: no other head is to be tried. Of cameras: ``probe()`` returns
         each `ProbedCamera`, a sentence for each of no use, and what this machine lacks. Nothing moves.
     probe_order
         Heads of a lower number probe a line first.
     bench
-        What a person does with a device on the bench (`drivers.probes`).
+        What a person does with a device on the bench: a `UnitBench`, a `CameraBench`, or a `ServoBench`.
     """
 
     open: Callable[[Mapping[str, Any], Context], Any]

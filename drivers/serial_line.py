@@ -1,4 +1,4 @@
-"""An open line of bytes to a device: a serial device, ``socket://HOST:PORT`` or ``rfc2217://HOST:PORT``.
+"""An open line of bytes to a device: a serial device or ``socket://HOST:PORT``.
 
 pyserial opens it; this module does not know the meaning of the bytes. It adds to pyserial 3.5, for every
 driver alike: A wait sleeps in the kernel, with a deadline of CLOCK_MONOTONIC. The line is this program's
@@ -14,7 +14,6 @@ import os
 import select
 import socket
 import termios
-import time
 from pathlib import Path
 from typing import Protocol
 from urllib.parse import urlsplit
@@ -26,9 +25,6 @@ from drivers.errors import BadOptions, LineLost
 
 CHUNK_BYTES = 4096
 CONNECT_TIMEOUT_S = WRITE_TIMEOUT_S = 0.5
-SLICE_S = 0.01
-"""pyserial's own timeout of one read, where there is no file to wait on. It never changes while the line is
-open, since changing it makes pyserial set up the port anew (over the network with rfc2217)."""
 
 BY_ID = Path("/dev/serial/by-id")
 """Where udev names USB adapters by maker, model and serial number."""
@@ -138,12 +134,9 @@ class SerialLine:
         self._device = device
         self._is_url = "://" in port
         self._serial = self._opened()
-        self._descriptor: int | None = None
-        self._poll: select.poll | None = None
-        with contextlib.suppress(OSError, AttributeError, ValueError):  # rfc2217 has no file behind it
-            self._descriptor = self._serial.fileno()
-            self._poll = select.poll()
-            self._poll.register(self._descriptor, select.POLLIN)
+        self._descriptor: int = self._serial.fileno()
+        self._poll = select.poll()
+        self._poll.register(self._descriptor, select.POLLIN)
         with contextlib.suppress(OSError, ValueError, NotImplementedError, AttributeError):
             self._serial.set_low_latency_mode(True)  # 1 ms instead of 16 ms, where the adapter has a timer
         try:
@@ -155,8 +148,8 @@ class SerialLine:
     def write(self, data: bytes) -> None:
         """Send bytes. Raises LineLost."""
         try:
-            sent = 0 if self._descriptor is None or self._is_url else _written(self._descriptor, data)
-            if sent < len(data):  # no file, or its buffer is full: pyserial waits for room
+            sent = 0 if self._is_url else _written(self._descriptor, data)
+            if sent < len(data):  # its buffer is full: pyserial waits for room
                 self._serial.write(data[sent:])
         except _BROKEN as error:
             raise self._lost("writing", error) from error
@@ -167,8 +160,6 @@ class SerialLine:
         Raises LineLost.
         """
         try:
-            if self._descriptor is None or self._poll is None:
-                return self._read_of_object(wait_s)
             # poll counts whole milliseconds; rounding up never cuts a deadline short
             if not self._poll.poll(-int(-wait_s * 1000 // 1)):
                 return b""
@@ -184,37 +175,26 @@ class SerialLine:
 
     def close(self) -> None:
         """Let go of the line, whatever state it is in."""
-        self._descriptor = self._poll = None
         with contextlib.suppress(*_BROKEN):
             self._serial.close()
 
     def _opened(self) -> serial.SerialBase:
         """The pyserial port, for this program alone where the kind of port allows it."""
         try:
-            if self.port.startswith(("socket://", "rfc2217://")):
+            if self._is_url:
                 parts = urlsplit(self.port)
-                if not parts.hostname or parts.port is None:
-                    raise ValueError(f"expected {parts.scheme}://HOST:PORT")
-            if self.port.startswith("socket://"):
-                return _SocketPort(self.port, timeout=SLICE_S, write_timeout=WRITE_TIMEOUT_S)
-            # rfc2217 refuses a write timeout, and a network port has no lock
-            own = {} if self._is_url else {"exclusive": True, "write_timeout": WRITE_TIMEOUT_S}
-            return serial.serial_for_url(self.port, baudrate=self.baud, timeout=SLICE_S, **own)
+                if parts.scheme != "socket" or not parts.hostname or parts.port is None:
+                    raise ValueError("expected a serial device or socket://HOST:PORT")
+                return _SocketPort(self.port, timeout=0, write_timeout=WRITE_TIMEOUT_S)
+            return serial.serial_for_url(
+                self.port, baudrate=self.baud, timeout=0, exclusive=True, write_timeout=WRITE_TIMEOUT_S
+            )
         except (ValueError, TypeError, OverflowError, NotImplementedError) as error:
             message = f"{self.port} at {self.baud} baud: {_reason(error)}"
             raise BadOptions(message, device=self._device) from error
         except (OSError, EOFError, termios.error) as error:
             message = f"{self.port} cannot be opened: {_reason(error)}{_unit_hint(self.port)}"
             raise LineLost(message, device=self._device, detail=self._at("opening it")) from error
-
-    def _read_of_object(self, wait_s: float) -> bytes:
-        """The same for a line without a file descriptor."""
-        until_s = time.monotonic() + wait_s
-        while True:
-            waiting = self._serial.in_waiting
-            data = bytes(self._serial.read(max(1, waiting))) if wait_s or waiting else b""
-            if data or time.monotonic() >= until_s:
-                return data
 
     def _lost(self, doing: str, error: BaseException) -> LineLost:
         message = f"{self.port} failed in {doing} (unplugged?): {_reason(error)}"

@@ -16,8 +16,7 @@ from drivers import pixels
 from drivers.aravis import find
 from drivers.aravis.camera_clock import CameraClock, ClockStepped
 from drivers.aravis.device import Device, Filled
-from drivers.aravis.options import AravisOptions, parse_options
-from drivers.aravis.settings import EXPOSURE
+from drivers.aravis.settings import EXPOSURE, AravisOptions, parse_options
 from drivers.clock import Clock
 from drivers.errors import NoCamera, StreamFailed
 from drivers.interfaces import CameraInfo, CameraSetting, Image
@@ -29,8 +28,7 @@ from drivers.newest import (
     ExposureWindow,
     TimedFrame,
 )
-from drivers.probes import CameraBench
-from drivers.registry import Driver
+from drivers.registry import CameraBench, Driver
 from drivers.values_set import ValuesSet
 
 log = logging.getLogger(__name__)

@@ -12,7 +12,7 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 
-from drivers.aravis.options import Stamped
+from drivers.aravis.settings import Stamped
 from drivers.newest import ExposureWindow
 
 DRIFT = 1e-4

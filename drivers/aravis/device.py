@@ -18,8 +18,16 @@ from calib.geometry.mode import SensorMode
 from drivers.aravis import find
 from drivers.aravis.camera_clock import WallClock
 from drivers.aravis.library import CONTROL_LOST, GenicamError, library
-from drivers.aravis.options import AravisOptions
-from drivers.aravis.settings import CHUNKS, EXPOSURE, Control, Feature, change, set_up, settings_of
+from drivers.aravis.settings import (
+    CHUNKS,
+    EXPOSURE,
+    AravisOptions,
+    Control,
+    Feature,
+    change,
+    set_up,
+    settings_of,
+)
 from drivers.errors import CameraBusy, DriverError, NoCamera, StreamFailed, UnsupportedFormat
 from drivers.interfaces import CameraSetting
 from drivers.pixels import GENICAM, PictureFormat

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from drivers.aravis.library import INSTALL, GenicamError, Library, installed, library
-from drivers.aravis.options import AravisOptions, parse_options
+from drivers.aravis.settings import AravisOptions, parse_options
 from drivers.errors import BadOptions, CameraBusy, DriverError, NoCamera, StreamFailed, UnsupportedFormat
 from drivers.pixels import GENICAM
-from drivers.probes import ProbedCamera
+from drivers.registry import ProbedCamera
 
 _LISTING = threading.Lock()
 """Aravis has one list of devices, which each search makes anew."""
@@ -143,7 +143,7 @@ def probe() -> tuple[list[ProbedCamera], list[str], str]:
 
 
 def present(options: Mapping[str, Any], name: str) -> str:
-    """Return which camera a configuration names, as `drivers.probes.CameraBench`; it is not opened.
+    """Return which camera a configuration names, as `drivers.registry.CameraBench`; it is not opened.
 
     Raises BadOptions, NoCamera.
     """

@@ -18,11 +18,15 @@ import math
 from collections.abc import Sequence
 
 from drivers.dynamixel.link import Link
-from drivers.dynamixel.models import WATCHDOG_TRIPPED
+from drivers.dynamixel.models import (
+    WATCHDOG_TRIPPED,
+    DynamixelAxisSettings,
+    DynamixelSettings,
+    dynamixel_settings,
+)
 from drivers.dynamixel.packets import GroupAnswer
 from drivers.dynamixel.registers import RegisterBlock
 from drivers.dynamixel.servo import Reboots, Servo, hardware_fault, motion_blocks
-from drivers.dynamixel.settings import DynamixelAxisSettings, DynamixelSettings, dynamixel_settings
 from drivers.dynamixel.workshop import BENCH
 from drivers.errors import DriverError, HardwareFault, Refused
 from drivers.registry import Driver

@@ -9,20 +9,37 @@ velocity unit is 0.05 % below the manual's.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from types import MappingProxyType
+from typing import Annotated, ClassVar, Literal, Self
 
+from pydantic import Field, model_validator
+
+from calib.files.records import ABSENT, problem
 from drivers.dynamixel.registers import ControlItem, vendor_names, vendor_table
 from drivers.errors import BadOptions
 from drivers.faults import nearest
-from drivers.servo_bus.settings import CountedModel
+from drivers.options import read_options
+from drivers.servo_bus.port import QUIET_S
+from drivers.servo_bus.settings import (
+    RESTING_POLL_S,
+    CountedModel,
+    HeadSettings,
+    ServoAxisSettings,
+    named_model,
+)
 
 RPM_RAD_PER_S = math.tau / 60
 REV_PER_MIN2_RAD_PER_S2 = math.tau / 3600
 POSITION_MODE = 3
 NO_SECONDARY_ID = 253  # and above
 WATCHDOG_TRIPPED = 255
+USUAL_WATCHDOG_S, SHORTEST_WATCHDOG_S = 0.3, 0.1
+WATCHDOG_STEP_S = 0.02
+SILENCE_SPARE_S = 0.05  # the servo's oscillator against ours
+POLL_BYTES = 20 + 2 * (11 + 43)  # the longer of the two instructions, and two replies of 43 bytes of data
 
 # By code: e-manual, control_table_baudrate_2.md (X, MX to 7, X330 to 6), p/control_table_8_baud_rate.md.
 BAUD_RATES = MappingProxyType(
@@ -63,8 +80,6 @@ OPERATING_MODES = MappingProxyType(
         16: "PWM",
     }
 )
-
-Meaning = Callable[["ServoModel", int], str]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,14 +196,11 @@ def what_is_needed(number: int) -> str:
     """Return what a servo is that the driver does not drive, and what it would need, by its model number."""
     theirs = vendor_names().get(number)
     if theirs is None:
-        return (
-            f"the model number {number}, nor do the tables of the installed dynamixel-sdk: needed is a "
-            "dynamixel-sdk that holds its .model table"
-        )
-    servo = f"the {theirs} (model number {number}); mastctl rig servo info reads it"
-    if theirs.startswith("ym"):
-        return f"{servo}. It needs registers laid out as those of X or P, which the Y family's are not"
-    return f"{servo}. Needed is a row in drivers/dynamixel/models.py: its unit of current and its backlash"
+        return f"the model number {number}, nor do the tables of the installed dynamixel-sdk"
+    return (
+        f"the {theirs} (model number {number}). Needed is a row in drivers/dynamixel/models.py: its unit of "
+        "current and its backlash, and registers laid out as those of X or P"
+    )
 
 
 def hardware_error_names(value: int) -> list[str]:
@@ -200,75 +212,103 @@ def hardware_error_names(value: int) -> list[str]:
 
 def register_meaning(model: ServoModel, name: str, value: int) -> str:
     """Return what a register's number means; empty where the number says it."""
-    meaning = _MEANINGS.get(name)
-    return "" if meaning is None else meaning(model, value)
+    known = {
+        "model_number": {value: model.name},
+        "baud": {code: f"{rate} baud" for code, rate in BAUD_RATES.items()},
+        "operating_mode": OPERATING_MODES,
+        "torque_enable": {0: "off", 1: "on"},
+        "bus_watchdog": {0: "off", WATCHDOG_TRIPPED: "tripped"},
+        "profile_velocity": {0: "as fast as it can"},
+        "profile_acceleration": {0: "as hard as it can"},
+    }
+    if value in known.get(name, {}):
+        return known[name][value]
+    if name in ("hardware_error", "shutdown"):
+        return ", ".join(hardware_error_names(value)) or "none"
+    if name.endswith(("_position", "_position_limit")):
+        return f"{math.degrees((value - model.centre_count) * model.count_rad):.3f} deg from its middle"
+    if name.endswith(("_velocity", "velocity_limit")):
+        return f"{value * model.velocity_unit_rad_per_s:.4f} rad/s"
+    if name.endswith(("_current", "current_limit")) and model.current_unit_A is not None:
+        return f"{value * model.current_unit_A:.3f} A"
+    if "voltage" in name:
+        return f"{value / 10:.1f} V"
+    return ""
 
 
-def _angle(model: ServoModel, value: int) -> str:
-    return f"{math.degrees((value - model.centre_count) * model.count_rad):.3f} deg from its middle"
+class DynamixelAxisSettings(ServoAxisSettings):
+    """One axis."""
+
+    model: Annotated[ServoModel, named_model(model_named, MODELS)]
+    """Which servo."""
+    on_hardware_error: Literal["report", "reboot"] = "report"
+    """``report`` leaves the servo as it is; ``reboot`` restarts it, which drops its torque."""
+    current_limit_A: Annotated[float, Field(ge=0.0001, le=30.0)] | None = None
+    """Written to the servo; left out: it stays as it is."""
+
+    @model_validator(mode="after")
+    def _check_current(self) -> Self:
+        model, limit_A = self.model, self.current_limit_A
+        if limit_A is None:
+            return self
+        if model.current_unit_A is None:
+            raise problem("current_limit_A", f"a {model.name} has no current limit")
+        if not 1 <= round(limit_A / model.current_unit_A) <= model.most_current_counts:
+            most_A = model.most_current_counts * model.current_unit_A
+            bounds = f"{model.current_unit_A:g} to {most_A:.4g} A for a {model.name}"
+            raise problem("current_limit_A", f"{limit_A:g} A where {bounds} is expected")
+        return self
 
 
-def _velocity(model: ServoModel, value: int) -> str:
-    return f"{value * model.velocity_unit_rad_per_s:.4f} rad/s"
+class DynamixelSettings(HeadSettings):
+    """A head of two servos on one bus."""
+
+    poll_bytes: ClassVar[int] = POLL_BYTES
+
+    pan: DynamixelAxisSettings
+    """The pan axis."""
+    tilt: DynamixelAxisSettings
+    """The tilt axis."""
+    baud: Annotated[int, Field(ge=9600, le=10_500_000)] = 1_000_000
+    """The line's bits per second."""
+    watchdog_s: Annotated[float, Field(ge=0.0, le=0.5)] = ABSENT
+    """After this silence the servos stop by themselves; 0 switches that off. Left out: 0.3 s, or as much less
+    as it takes to be at rest 0.5 s after the last poll, braking included."""
+
+    @model_validator(mode="after")
+    def _check_watchdog(self) -> Self:
+        self._set_patience("watchdog_s", USUAL_WATCHDOG_S, SHORTEST_WATCHDOG_S)
+        trips_s = self.watchdog_counts * WATCHDOG_STEP_S
+        most_s = round(trips_s - 1 / self.poll_hz - QUIET_S, 9)
+        if self.watchdog_s and self.reply_timeout_s > most_s:
+            raise problem(
+                "reply_timeout_s",
+                f"{self.reply_timeout_s:g} s with watchdog_s {self.watchdog_s:.3g}, which the servos count "
+                f"as {trips_s:.3g} s: one lost reply would stop the head; {most_s:.3g} s or less is expected",
+            )
+        return self
+
+    @property
+    def watchdog_counts(self) -> int:
+        """The watchdog register's value, rounded down; 0 for off."""
+        return math.floor(self.watchdog_s / WATCHDOG_STEP_S + 1e-6)
+
+    @property
+    def resting_poll_s(self) -> float:
+        """How often servos at rest are read, seconds; a lost reply must not trip the watchdog."""
+        if not self.watchdog_counts:
+            return super().resting_poll_s
+        silence_s = self.watchdog_counts * WATCHDOG_STEP_S - self.reply_timeout_s - QUIET_S
+        return max(1 / self.poll_hz, min(RESTING_POLL_S, silence_s / 2))
+
+    @property
+    def silence_s(self) -> float:
+        """How long nothing may be sent so that the watchdogs have stopped both axes; 0 without them."""
+        if not self.watchdog_counts:
+            return 0.0
+        brakes_s = self.speed_rad_per_s / self.acceleration_rad_per_s2
+        return self.watchdog_counts * WATCHDOG_STEP_S + brakes_s + SILENCE_SPARE_S
 
 
-def _acceleration(model: ServoModel, value: int) -> str:
-    return f"{value * model.acceleration_unit_rad_per_s2:.4f} rad/s2" if value else "as hard as it can"
-
-
-def _current(model: ServoModel, value: int) -> str:
-    return "" if model.current_unit_A is None else f"{value * model.current_unit_A:.3f} A"
-
-
-def _load(model: ServoModel, value: int) -> str:
-    return f"{value / 10:.1f} % load" if model.current_unit_A is None else _current(model, value)
-
-
-def _volts(model: ServoModel, value: int) -> str:
-    return f"{value / 10:.1f} V"
-
-
-def _errors(model: ServoModel, value: int) -> str:
-    return ", ".join(hardware_error_names(value)) or "none"
-
-
-_MEANINGS: Mapping[str, Meaning] = {
-    "model_number": lambda model, value: model.name,
-    "baud": lambda model, value: f"{BAUD_RATES[value]} baud" if value in BAUD_RATES else "unknown baud rate",
-    "return_delay": lambda model, value: f"{2 * value} us",
-    "operating_mode": lambda model, value: OPERATING_MODES.get(value, "unknown mode"),
-    "secondary_id": lambda model, value: "none" if value >= NO_SECONDARY_ID else "also obeys this id",
-    "min_position_limit": _angle,
-    "max_position_limit": _angle,
-    "present_position": _angle,
-    "goal_position": _angle,
-    "position_trajectory": _angle,
-    "homing_offset": lambda model, value: f"{math.degrees(value * model.count_rad):.3f} deg",
-    "velocity_limit": _velocity,
-    "goal_velocity": _velocity,
-    "profile_velocity": lambda model, value: _velocity(model, value) if value else "as fast as it can",
-    "present_velocity": _velocity,
-    "velocity_trajectory": _velocity,
-    "moving_threshold": _velocity,
-    "profile_acceleration": _acceleration,
-    "current_limit": _current,
-    "goal_current": _current,
-    "present_current": _load,
-    "max_voltage_limit": _volts,
-    "min_voltage_limit": _volts,
-    "present_voltage": _volts,
-    "temperature_limit": lambda model, value: f"{value} C",
-    "present_temperature": lambda model, value: f"{value} C",
-    "hardware_error": _errors,
-    "shutdown": lambda model, value: f"shuts down on: {_errors(model, value)}",
-    "bus_watchdog": lambda model, value: {0: "off", WATCHDOG_TRIPPED: "tripped"}.get(
-        value, f"{20 * value} ms"
-    ),
-    "torque_enable": lambda model, value: "on" if value else "off",
-    "status_return_level": lambda model, value: {
-        0: "answers pings",
-        1: "answers reads",
-        2: "answers everything",
-    }.get(value, "unknown"),
-    "moving_status": lambda model, value: "in position" if value & 1 else "not in position",
-}
+dynamixel_settings = partial(read_options, DynamixelSettings)
+"""Return the head that the options of ``driver: dynamixel`` describe. Raises BadOptions."""

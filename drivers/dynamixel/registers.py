@@ -7,7 +7,6 @@ middle and the ends of the turn in position mode. The signs of most are from the
 
 from __future__ import annotations
 
-import re
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -29,8 +28,6 @@ _NAMES = {
     "Present Input Voltage": "present_voltage",
 }
 """What is called otherwise here than in the tables of the SDK, small letters and underscores aside."""
-
-_SIGNED_POSITIONS = {"Homing Offset", "Goal Position", "Present Position", "Position Trajectory"}
 
 _KNOWN = """
     model_number firmware id baud return_delay drive_mode operating_mode secondary_id -homing_offset
@@ -105,22 +102,6 @@ def vendor_table(number: int) -> VendorTable:
 def vendor_names() -> Mapping[int, str]:
     """Return every servo that the SDK has a table of, as it spells them, by model number."""
     return {number: file.stem for number, file in _files().items()}
-
-
-def vendor_registers(number: int) -> list[ControlItem]:
-    """Return every register that the SDK's table of a model holds, by address; indirect ones are left out.
-
-    Signed are those that the table says to be, and positions.
-    """
-    found = _sections(_files()[number])
-    signed = {row[0] for row in found.get("unit info", []) if row[-1] == "signed"} | _SIGNED_POSITIONS
-    registers = {}
-    for address, length, theirs in found["control table"]:
-        if not theirs.startswith("Indirect"):
-            window = int(address), int(length)
-            name = re.sub(r"\W+", "_", theirs.lower()).strip("_")
-            registers[window] = ControlItem(name, *window, theirs in signed, window=window)
-    return [registers[window] for window in sorted(registers)]
 
 
 @cache

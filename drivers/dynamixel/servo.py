@@ -18,12 +18,13 @@ from drivers.dynamixel.models import (
     NO_SECONDARY_ID,
     POSITION_MODE,
     WATCHDOG_TRIPPED,
+    DynamixelAxisSettings,
+    DynamixelSettings,
     hardware_error_names,
     what_is_needed,
 )
 from drivers.dynamixel.packets import GroupAnswer
 from drivers.dynamixel.registers import ControlItem, RegisterBlock
-from drivers.dynamixel.settings import DynamixelAxisSettings, DynamixelSettings
 from drivers.errors import BadReply, DriverError, HardwareFault, NoReply, Refused, WrongDevice
 from drivers.servo_bus.course import ServoSample
 from drivers.servo_bus.exchange import ATTEMPTS, LATE_S, again

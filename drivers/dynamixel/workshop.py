@@ -6,21 +6,20 @@ For one thread and a line that no daemon holds. Nothing here moves a servo.
 from __future__ import annotations
 
 from contextlib import suppress
-from functools import partial
 
 from drivers.dynamixel.link import Link, Pinged
 from drivers.dynamixel.models import (
     BAUD_RATES,
     MODELS,
     MODELS_BY_NUMBER,
+    POLL_BYTES,
     ServoModel,
     hardware_error_names,
     register_meaning,
     what_is_needed,
 )
-from drivers.dynamixel.registers import vendor_names, vendor_registers
+from drivers.dynamixel.registers import vendor_names
 from drivers.dynamixel.servo import ServoTable, identified
-from drivers.dynamixel.settings import POLL_BYTES
 from drivers.errors import NoReply, Refused, WrongDevice
 from drivers.servo_bus.bench import (
     FoundServo,
@@ -48,13 +47,8 @@ def _found(link: Link, ping: Pinged) -> FoundServo:
 
 
 def facts(link: Link, servo_id: int) -> ServoFacts:
-    """Read every register of a servo that the driver knows; of another one, all that the SDK's table holds.
-
-    Raises WrongDevice if neither knows its model; NoReply, BadReply, Refused, LineLost.
-    """
+    """Read every register of a servo. Raises WrongDevice for a model that the driver does not know."""
     pinged = identified(link, servo_id, f"servo {servo_id}")
-    if pinged.model_number not in MODELS_BY_NUMBER and pinged.model_number in vendor_names():
-        return _vendor_facts(link, pinged)
     model, firmware = _known(pinged), pinged.firmware
     table = table_of(link, servo_id, model)
     values: dict[str, int] = {}
@@ -63,21 +57,6 @@ def facts(link: Link, servo_id: int) -> ServoFacts:
             values[name] = table.get(name)
     meanings = {name: register_meaning(model, name, value) for name, value in values.items()}
     return ServoFacts(servo_id, model.name, firmware, values, {n: m for n, m in meanings.items() if m})
-
-
-def _vendor_facts(link: Link, pinged: Pinged) -> ServoFacts:
-    """Read a servo by the SDK's table, one register after another, each after a silence.
-
-    What changes by itself is read one time, all else until two answers agree.
-    """
-    values: dict[str, int] = {}
-    for register in vendor_registers(pinged.model_number):
-        changing = register.name.startswith(("present_", "realtime_", "moving")) or "traj" in register.name
-        read = partial(link.read_once if changing else link.agreed, pinged.servo_id, register)
-        with suppress(Refused):  # this firmware has none
-            values[register.name] = again(link, read)
-    name = vendor_names()[pinged.model_number]
-    return ServoFacts(pinged.servo_id, name, pinged.firmware, values, {})
 
 
 def identify(link: Link, servo_id: int) -> tuple[ServoModel, int]:

@@ -24,9 +24,8 @@ from drivers.approach import check_goal
 from drivers.clock import Clock, ClockLock, SystemClock, deadlines_on
 from drivers.errors import BadReply, DriverError, HardwareFault, LineLost, NoReply
 from drivers.flir_ptu import protocol as queries
-from drivers.flir_ptu.axis import StepAxis, StepCount
+from drivers.flir_ptu.axis import DEVICE, Options, StepAxis, StepCount, options_from
 from drivers.flir_ptu.conversation import Conversation, StopCameFirst
-from drivers.flir_ptu.options import DEVICE, Options, options_from
 from drivers.flir_ptu.unit import SupplyWatch, checked_version, measure, ready_axes
 from drivers.flir_ptu.workshop import BENCH, probe, talking
 from drivers.interfaces import AxisMotion, HeadInfo, PanTilt, Reading

@@ -22,9 +22,8 @@ from itertools import pairwise
 from drivers.clock import Clock
 from drivers.errors import BadReply, OutOfRange, Refused, WrongDevice
 from drivers.flir_ptu import protocol as queries
-from drivers.flir_ptu.axis import SeenPosition, StepAxis
+from drivers.flir_ptu.axis import DEVICE, Options, SeenPosition, StepAxis
 from drivers.flir_ptu.conversation import Conversation
-from drivers.flir_ptu.options import DEVICE, Options
 
 log = logging.getLogger(__name__)
 

@@ -11,9 +11,9 @@ from typing import Any
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, Refused
 from drivers.flir_ptu import protocol as queries
+from drivers.flir_ptu.axis import BAUDS, DEVICE
 from drivers.flir_ptu.conversation import Conversation
-from drivers.flir_ptu.options import BAUDS, DEVICE
-from drivers.probes import Ends, ProbedHead, UnitBench
+from drivers.registry import Ends, ProbedHead, UnitBench
 from drivers.serial_line import ByteLine, OpenLine, SerialLine
 
 ARCSEC_RAD = math.radians(1 / 3600)

@@ -11,7 +11,7 @@ from typing import Any
 
 from drivers.clock import Clock
 from drivers.errors import BadOptions, DriverError, WrongDevice
-from drivers.probes import Ends, ProbedHead
+from drivers.registry import Ends, ProbedHead
 from drivers.serial_line import OpenLine, SerialLine
 from drivers.servo_bus.exchange import REPLY_TIMEOUT_S, BusLink
 from drivers.servo_bus.settings import CountedModel

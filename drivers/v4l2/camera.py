@@ -23,14 +23,12 @@ from drivers.clock import Clock, SystemClock
 from drivers.errors import StreamFailed, UnsupportedFormat
 from drivers.interfaces import CameraInfo, CameraSetting, Image
 from drivers.newest import FIRST_PAUSE_S, LATE_S, CapturedCamera, TimedFrame
-from drivers.probes import CameraBench
-from drivers.registry import Driver
+from drivers.registry import CameraBench, Driver
 from drivers.v4l2 import abi, find
 from drivers.v4l2.controls import get_value, list_controls
 from drivers.v4l2.exposure import GROUPS, ExposureControl
 from drivers.v4l2.node import Dequeued, Node
-from drivers.v4l2.options import CameraOptions, parse_options
-from drivers.v4l2.settings import EXPOSURE, change, settings_of, with_settings
+from drivers.v4l2.settings import EXPOSURE, CameraOptions, change, parse_options, settings_of, with_settings
 from drivers.v4l2.stamps import Arrived, Spacing, StampCheck, Timing, exposure_window
 from drivers.v4l2.stream import Stream, sizes_text
 
@@ -338,7 +336,7 @@ class V4l2Camera(CapturedCamera[Arrived]):
 
 
 def present(options: Mapping[str, Any], name: str) -> str:
-    """Return which camera a configuration names, as `drivers.probes.CameraBench`. Raises DriverError."""
+    """Return which camera a configuration names, as `drivers.registry.CameraBench`. Raises DriverError."""
     wanted = parse_options(options, name)
     with find.open_node(wanted.address, name) as node:
         offered, place = node.formats(), f"{node.identity.card} at {node.identity.bus}"

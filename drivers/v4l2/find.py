@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from drivers.errors import BadOptions, DriverError, NoCamera, NoPermission, UnsupportedFormat
 from drivers.pixels import FORMATS
-from drivers.probes import ProbedCamera
+from drivers.registry import ProbedCamera
 from drivers.v4l2.controls import Value
 from drivers.v4l2.node import Node, capture_nodes
 
@@ -242,7 +242,7 @@ def _usual(camera: FoundCamera, found: list[FoundCamera]) -> dict[str, Any]:
 
 
 def table() -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the connected cameras, as `drivers.probes.CameraBench`."""
+    """Return the connected cameras, as `drivers.registry.CameraBench`."""
     rows = [
         {
             "card": c.card, "bus": c.bus, "driver": c.driver, "node": str(c.node),

@@ -20,8 +20,7 @@ from drivers.v4l2.controls import (
     set_value,
 )
 from drivers.v4l2.node import Node
-from drivers.v4l2.options import CameraOptions
-from drivers.v4l2.settings import EXPOSURE, EXPOSURE_UNIT_S, MEANINGS, value_of
+from drivers.v4l2.settings import EXPOSURE, EXPOSURE_UNIT_S, MEANINGS, CameraOptions, value_of
 from drivers.v4l2.stamps import StampRule
 from drivers.values_set import ValuesSet
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from drivers.dynamixel import workshop as dynamixel
 from drivers.dynamixel.link import Link
-from drivers.dynamixel.settings import dynamixel_settings
+from drivers.dynamixel.models import dynamixel_settings
 from drivers.feetech import servos as feetech
 from drivers.feetech.head import feetech_settings
 from drivers.feetech.servos import FeetechLink

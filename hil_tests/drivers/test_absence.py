@@ -9,7 +9,7 @@ import pytest
 from drivers.absent import Absence
 from drivers.dynamixel.servo import Reboots
 from drivers.errors import BadOptions, LineLost
-from drivers.flir_ptu.options import options_from
+from drivers.flir_ptu.axis import options_from
 
 
 def test_each_failed_try_waits_longer_until_the_device_is_back() -> None:

@@ -10,9 +10,9 @@ import pytest
 import yaml
 
 from calib.files.mast_file import load_rig
-from drivers.dynamixel.settings import dynamixel_settings
-from drivers.flir_ptu.options import options_from as ptu_options
-from drivers.v4l2.options import parse_options
+from drivers.dynamixel.models import dynamixel_settings
+from drivers.flir_ptu.axis import options_from as ptu_options
+from drivers.v4l2.settings import parse_options
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon

@@ -17,12 +17,12 @@ from calib.files.records import schema_of
 from calib.files.yaml_text import parse_mapping
 from calib.survey.reader import SurveyRecord
 from calib.targets.board_file import BoardFileRecord
-from drivers.aravis.options import AravisOptions
-from drivers.dynamixel.settings import DynamixelSettings
+from drivers.aravis.settings import AravisOptions
+from drivers.dynamixel.models import DynamixelSettings
 from drivers.feetech.head import FeetechSettings
-from drivers.flir_ptu.options import Options
+from drivers.flir_ptu.axis import Options
 from drivers.recordings.replay import ReplayOptions
-from drivers.v4l2.options import CameraOptions
+from drivers.v4l2.settings import CameraOptions
 from hil_tests.calib.files import test_store
 from hil_tests.calib.survey import test_survey
 from hil_tests.calib.survey.survey_case import FILES as FILES_OF_A_SURVEY

@@ -19,7 +19,7 @@ from unittest.mock import patch
 
 from drivers.clock import Clock, SystemClock
 from drivers.dynamixel.head import DynamixelHead
-from drivers.dynamixel.settings import dynamixel_settings
+from drivers.dynamixel.models import dynamixel_settings
 from drivers.faults import FaultPanel
 from drivers.feetech.head import FeetechHead, feetech_settings
 from drivers.flir_ptu import conversation

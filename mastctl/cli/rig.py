@@ -14,7 +14,7 @@ from mastctl.cli.options import at_least, command, finite_number, option
 from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, check_folder
 
 if TYPE_CHECKING:
-    from drivers.probes import ProbedHead
+    from drivers.registry import ProbedHead
     from mastctl.answers import Status
 
 HEADS = "ptu_d46_70|dynamixel_x|ph42"

@@ -18,7 +18,7 @@ from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, tables_of
 if TYPE_CHECKING:
     from drivers.clock import Clock
     from drivers.faults import FaultPanel
-    from drivers.probes import UnitBench
+    from drivers.registry import UnitBench
     from drivers.servo_bus.bench import ServoBench
     from drivers.sim.axis import WireAxis
     from drivers.sim.wire.carrier import WireDevice
@@ -66,7 +66,7 @@ def _bench(args: argparse.Namespace) -> ServoBench:
 
 def _unit_bench() -> UnitBench:
     """The bench of pan/tilt units."""
-    from drivers.probes import UnitBench
+    from drivers.registry import UnitBench
 
     return next(bench for bench in _benches().values() if isinstance(bench, UnitBench))
 
@@ -159,7 +159,7 @@ def _unit_baud(text: str) -> int:
 
 
 UNIT = (
-    option("PORT", "serial device, socket://HOST:4000 or rfc2217://HOST:PORT"),
+    option("PORT", "serial device or socket://HOST:4000"),
     option("--baud B", "bits a second (default: as units come from the factory)", type=_unit_baud),
 )
 

@@ -12,8 +12,7 @@ from calib.files.mast_file import load_rig
 from drivers.errors import BadOptions, CameraBusy, DriverError, NoCamera, NoPermission
 from drivers.faults import PAN_TILT
 from drivers.hardware import DeviceSettings, clock_for, is_hardware
-from drivers.probes import UnitBench
-from drivers.registry import Driver, driver_of, installed_drivers
+from drivers.registry import Driver, UnitBench, driver_of, installed_drivers
 from drivers.servo_bus.bench import ServoBench, line_words
 from mastctl.config import Config, check_cameras, load_config
 from mastctl.safety.state_folder import usual_folder

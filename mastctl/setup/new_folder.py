@@ -22,8 +22,7 @@ from calib.files import save_bytes
 from calib.files.mast_file import MAST_SCHEMA, load_rig
 from calib.files.yaml_text import dump_mapping
 from drivers.faults import PAN_TILT
-from drivers.probes import ProbedCamera, ProbedHead
-from drivers.registry import driver_of, drivers_of
+from drivers.registry import ProbedCamera, ProbedHead, driver_of, drivers_of
 from drivers.servo_bus.bench import USUAL_BAUD, ServoBench, ServosOnLine
 from drivers.sim.heads import DEFAULT_HEADS
 from mastctl.config import CONFIG_SCHEMA, check_cameras, load_config

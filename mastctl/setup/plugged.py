@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.errors import DriverError
-from drivers.probes import ProbedCamera, ProbedHead
-from drivers.registry import drivers_of
+from drivers.registry import ProbedCamera, ProbedHead, drivers_of
 from drivers.servo_bus.bench import FoundServo, ServoBench, ServosOnLine
 from mastctl.setup.machine import ExaminedMachine, examine_port, serial_lines
 

@@ -178,7 +178,7 @@ def test_what_the_camera_does_not_have_is_refused_with_what_it_has(
 WITHOUT_DESCRIPTORS = """
 import os, resource
 from drivers.aravis import find, library
-from drivers.aravis.options import AravisOptions
+from drivers.aravis.settings import AravisOptions
 from drivers.errors import StreamFailed
 library.library()
 resource.setrlimit(resource.RLIMIT_NOFILE, (64, 64))

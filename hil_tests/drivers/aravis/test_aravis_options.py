@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from drivers.aravis import library
-from drivers.aravis.options import parse_options
+from drivers.aravis.settings import parse_options
 from drivers.errors import BadOptions
 
 

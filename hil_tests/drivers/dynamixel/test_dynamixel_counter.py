@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from drivers.dynamixel.counter import Counter
+from drivers.dynamixel.link import Counter
 
 PERIOD_S, WIRE_S = 0.02, 0.002
 

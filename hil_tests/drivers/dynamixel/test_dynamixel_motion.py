@@ -7,8 +7,7 @@ from typing import Any
 
 import pytest
 
-from drivers.dynamixel.models import MODELS
-from drivers.dynamixel.settings import dynamixel_settings
+from drivers.dynamixel.models import MODELS, dynamixel_settings
 from drivers.errors import BadOptions, BadReply
 from drivers.servo_bus.course import AxisCourse, ServoSample, Truth
 
@@ -151,8 +150,8 @@ def test_a_position_that_leaps_is_refused() -> None:
         ({"id": 2}, "2, as tilt.id; two ids are expected"),
         ({"limits_rad": [-3.2, 2.0]}, "does not cross the seam"),
         ({"approach": "positive", "approach_rad": 0.004}, "does not take up the backlash"),
-        ({"model": "YM070-210-M001-RH"}, "which the Y family's are not"),
-        ({"model": "XW540-T260-R"}, "(model number 1170); mastctl rig servo info reads it. Needed is a row"),
+        ({"model": "YM070-210-M001-RH"}, "laid out as those of X or P"),
+        ({"model": "XW540-T260-R"}, "(model number 1170). Needed is a row"),
         ({"model": "MX-28", "current_limit_A": 1.0}, "has no current limit"),
         ({"current_limit_A": 3.3}, "0.00269 to 3.209 A for a XM430-W350 is expected"),
         ({"limits_rad": [0.1, 0.1012]}, "hold no two counts of a XM430-W350, whose count is 0.0015 rad"),

@@ -9,17 +9,14 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import socket
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from serial import rfc2217
 
 from drivers.clock import SystemClock
 from drivers.errors import (
@@ -38,7 +35,7 @@ from drivers.flir_ptu.workshop import home
 from drivers.interfaces import Reading
 from drivers.sim.wire.line import PtyLine
 from hil_tests.drivers.flir_ptu.scripted_ptu import OPTIONS, Bench, ScriptedPtu
-from hil_tests.waiting import NET_S, until
+from hil_tests.waiting import NET_S
 from mastctl.cli.main import main
 
 ARCSEC = math.pi / 180 / 3600
@@ -661,43 +658,3 @@ def test_a_unit_that_is_refused_leaves_the_line_to_the_next_try(opened: Bench) -
         refusals.append(refused)
     unit.resolutions["P"] = "185.142857"
     open_head(options, opened.clock, line.open).close()
-
-
-def serve_rfc2217(listener: socket.socket, unit: ScriptedPtu) -> None:
-    """A serial server with a unit behind it, by pyserial's own server side, for one client."""
-    connection, _ = listener.accept()
-    lines = {"cts": True, "dsr": True, "ri": False, "cd": True, "rts": True, "dtr": True}
-    settings = {
-        "baudrate": 9600,
-        "bytesize": 8,
-        "parity": "N",
-        "stopbits": 1,
-        "xonxoff": False,
-        "rtscts": False,
-    }
-    port = SimpleNamespace(
-        **lines, **settings, break_condition=False,
-        reset_input_buffer=lambda: None, reset_output_buffer=lambda: None,
-    )  # fmt: skip
-    manager = rfc2217.PortManager(port, SimpleNamespace(write=connection.sendall))
-    with connection, suppress(OSError):
-        while data := connection.recv(4096):
-            heard = b"".join(manager.filter(data))
-            for reply in unit.receive(heard, 0.0):
-                connection.sendall(b"".join(manager.escape(reply.data)))
-
-
-@pytest.mark.usefixtures("patient")
-def test_a_serial_server_by_rfc2217_serves_as_well() -> None:
-    unit = ScriptedPtu()
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        server = threading.Thread(target=serve_rfc2217, args=(listener, unit), daemon=True)
-        server.start()
-        head = open_head({**OPTIONS, "port": f"rfc2217://127.0.0.1:{listener.getsockname()[1]}"})
-        head.move(0.5, 0.2)
-        until(lambda: not head.read().moving, "rest")
-        assert head.read().pan_rad == pytest.approx(0.5, abs=PAN_STEP_RAD / 2)
-        head.close()
-        server.join(60)
-        assert not server.is_alive()
-        assert unit.heard[-1] == "H"

@@ -8,7 +8,7 @@ from __future__ import annotations
 import pytest
 
 from drivers.flir_ptu import protocol
-from drivers.flir_ptu.options import BAUDS
+from drivers.flir_ptu.axis import BAUDS
 from drivers.flir_ptu.protocol import answer_of, number_of
 from drivers.flir_ptu.unit import supply_of
 from drivers.sim.axis import AxisSettings, WireAxis

@@ -24,7 +24,7 @@ from drivers.pixels import PictureFormat
 from drivers.v4l2 import abi, find
 from drivers.v4l2.camera import V4l2Camera, open_camera
 from drivers.v4l2.node import Dequeued, Identity
-from drivers.v4l2.options import parse_options
+from drivers.v4l2.settings import parse_options
 from drivers.v4l2.stamps import StampRule
 from drivers.values_set import ValuesSet
 from hil_tests.drivers.v4l2.v4l2_sensor import TurnedClock

@@ -22,7 +22,7 @@ from drivers.v4l2 import camera as camera_module
 from drivers.v4l2 import exposure
 from drivers.v4l2.camera import V4l2Camera
 from drivers.v4l2.controls import CameraControl
-from drivers.v4l2.options import parse_options
+from drivers.v4l2.settings import parse_options
 from hil_tests.drivers.v4l2.v4l2_sensor import AUTO, EXPOSURE, Sensor, SensorNode, Shot, TurnedClock, use
 from hil_tests.waiting import NET_S, until
 

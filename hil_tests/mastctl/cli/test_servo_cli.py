@@ -133,7 +133,7 @@ def test_set_id_drops_torque_only_when_told_to(bench: Bench, capsys: pytest.Capt
 @pytest.mark.parametrize(
     ("words", "error"),
     [
-        (("info", "foo://x", "1"), "protocol 'foo' not known"),
+        (("info", "foo://x", "1"), "expected a serial device or socket"),
         (("info", "PORT", "1", "--family", "flir_ptu"), "no servos: 'mastctl rig ptu info PORT' queries it"),
     ],
 )

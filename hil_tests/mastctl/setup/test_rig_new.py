@@ -18,11 +18,11 @@ from calib.errors import BadFile
 from calib.files import save_bytes
 from calib.files.mast_file import load_rig
 from calib.files.yaml_text import parse_mapping
-from drivers.dynamixel.settings import dynamixel_settings
+from drivers.dynamixel.models import dynamixel_settings
 from drivers.dynamixel.workshop import BENCH
 from drivers.feetech.head import feetech_settings
-from drivers.flir_ptu.options import options_from
-from drivers.probes import ProbedCamera
+from drivers.flir_ptu.axis import options_from
+from drivers.registry import ProbedCamera
 from drivers.servo_bus.bench import FoundServo, ServosOnLine
 from drivers.sim.axis import WireAxis
 from drivers.sim.heads import PRESETS, HeadModel
@@ -34,7 +34,7 @@ from drivers.sim.wire.feetech_servo import SimulatedFeetechServo
 from drivers.sim.wire.line import MemoryLine
 from drivers.sim.wire.ptu import SimulatedPtu
 from drivers.simulation_clock import SimulationClock
-from drivers.v4l2.options import parse_options
+from drivers.v4l2.settings import parse_options
 from mastctl.cli.main import main
 from mastctl.config import load_config
 from mastctl.packaged import schema_files

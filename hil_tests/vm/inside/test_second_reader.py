@@ -17,7 +17,7 @@ from drivers.v4l2 import find
 from drivers.v4l2.camera import V4l2Camera
 from drivers.v4l2.controls import list_controls
 from drivers.v4l2.find import Address
-from drivers.v4l2.options import parse_options
+from drivers.v4l2.settings import parse_options
 from hil_tests.vm.inside.conftest import BUS, options
 
 pytestmark = pytest.mark.skipif(

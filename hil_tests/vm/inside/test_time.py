@@ -11,7 +11,7 @@ import pytest
 
 from drivers.errors import NoFreshFrame
 from drivers.v4l2.camera import V4l2Camera, open_camera
-from drivers.v4l2.options import CameraOptions
+from drivers.v4l2.settings import CameraOptions
 
 from .conftest import RATE_HZ, TURNED_CLOCK, options
 
