@@ -30,7 +30,7 @@ from mastctl.devices.judge import LEAST_CONE_RAD, SUN, WIDEST_CONE_RAD, Limits, 
 from mastctl.devices.keep_out import Box
 from mastctl.motion.settings import TrackingSettings
 from mastctl.packaged import default_config
-from mastctl.recorder.settings import RecordSettings
+from mastctl.recorder.folder import RecordSettings
 
 CONFIG_SCHEMA = "mastctl/config/1"
 DEFAULT_HOST = "127.0.0.1"

@@ -30,9 +30,9 @@ from mastctl.devices.frames import StampedFrame
 from mastctl.packaged import default_config
 from mastctl.recorder import recorder as recorder_module
 from mastctl.recorder.entries import AttachedMast
+from mastctl.recorder.folder import RecordSettings
+from mastctl.recorder.recorded import repair
 from mastctl.recorder.recorder import Recorder
-from mastctl.recorder.repair import repair
-from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.writer import Attached
 
 STEP_S = 0.005

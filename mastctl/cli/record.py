@@ -39,7 +39,7 @@ def _show(args: argparse.Namespace) -> Answer:
 )
 def _repair(args: argparse.Namespace) -> Answer:
     from drivers.recordings.frames import recording_files
-    from mastctl.recorder.repair import repair
+    from mastctl.recorder.recorded import repair
 
     out = args.out or args.file.with_name(f"{args.file.stem}.repaired.mcap")
     found = dict(repair(recording_files(args.file), out))
@@ -84,8 +84,7 @@ def _served(args: argparse.Namespace) -> int:
 def _what_if(args: argparse.Namespace, recording: Recording) -> Answer:
     """Evaluate a recording's pointings and hand-offs again."""
     from calib.files.mast_file import load_rig
-    from mastctl.recorder.what_if import handoffs_with, pointings_with, seen_in
-    from mastctl.recorder.what_if_report import WhatIf, write_what_if
+    from mastctl.recorder.what_if import WhatIf, handoffs_with, pointings_with, seen_in, write_what_if
     from mastctl.watch.handoffs import handoff_of
 
     mast = load_rig(args.mast)
@@ -100,7 +99,7 @@ def _what_if(args: argparse.Namespace, recording: Recording) -> Answer:
 
 
 def _shown(what_if: Any, page: Path | None) -> Iterator[Shown]:
-    from mastctl.recorder import what_if_report as report
+    from mastctl.recorder import what_if as report
 
     pointings, handoffs = report.pointing_table(what_if), report.handoff_table(what_if)
     for title, table in (("pointings", pointings), ("hand-offs", handoffs)):

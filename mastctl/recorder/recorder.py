@@ -30,8 +30,7 @@ from mastctl.control.publisher import TOPICS, Published, Publisher, Topic
 from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError, NotKnown, NotNow, Unable
 from mastctl.recorder.entries import AttachedMast, Entries, Entry
-from mastctl.recorder.folder import MB, Recorded, RecordFolder
-from mastctl.recorder.settings import RecordSettings
+from mastctl.recorder.folder import MB, Recorded, RecordFolder, RecordSettings
 from mastctl.recorder.writer import Attached, Clocks, RecordFile
 
 log = logging.getLogger(__name__)

@@ -20,8 +20,8 @@ from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.errors import NotKnown
 from mastctl.recorder.entries import AttachedMast
+from mastctl.recorder.folder import RecordSettings
 from mastctl.recorder.recorder import Recorder
-from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.writer import Attached
 from mastctl.service.service import published_value
 

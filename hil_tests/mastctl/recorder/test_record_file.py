@@ -28,7 +28,7 @@ from hil_tests.mastctl.recorder.recorder_world import (
     reading,
     records,
 )  # fmt: skip
-from mastctl.recorder.repair import repair
+from mastctl.recorder.recorded import repair
 from mastctl.recorder.writer import Clocks, RecordFile
 
 

@@ -17,8 +17,8 @@ from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.config import Config, Listen, load_config
 from mastctl.daemon import RunningDaemon
+from mastctl.recorder.folder import RecordSettings
 from mastctl.recorder.recorded import read_whole
-from mastctl.recorder.settings import RecordSettings
 
 
 def config_with(folder: Path, ring_s: float | None) -> Config:

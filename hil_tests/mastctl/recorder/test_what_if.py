@@ -22,9 +22,9 @@ from mastctl.config import Listen, load_config
 from mastctl.control.publisher import Publisher
 from mastctl.daemon import RunningDaemon
 from mastctl.recorder.entries import AttachedMast
+from mastctl.recorder.folder import RecordSettings
 from mastctl.recorder.recorded import Recording, read_whole
 from mastctl.recorder.recorder import Recorder
-from mastctl.recorder.settings import RecordSettings
 from mastctl.recorder.what_if import WouldBe, pointings_with, rms, seen_in
 from mastctl.recorder.writer import Attached
 
