@@ -37,7 +37,7 @@ LOGGED = re.compile(r"^WARNING (?:drivers|mastctl)\.[\w.]+: .*\n", re.MULTILINE)
 LONGEST_S = 1800.0
 """A net for one command, on a machine with much else to do."""
 REPOSITORY = Path(__file__).parents[1]
-PAGES = ("first-pointing", "servos-to-verdict", "first-ci-test", "recalibrate")
+PAGES = ("first-pointing", "panorama", "servos-to-verdict", "first-ci-test", "recalibrate")
 
 
 def blocks(text: str) -> list[tuple[str, str, str]]:

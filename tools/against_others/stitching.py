@@ -28,19 +28,14 @@ from tools.command import end, options, rms, show
 
 MER = Path(__file__).resolve().parents[2] / "hil_tests" / "data" / "mer_navcam"
 PRODUCTS = "1N4910*.IMG"
-GREY_OF_12_BITS = 1.0 / 16.0
 CONFIDENCE = 0.3
 
 
 def flight_pictures() -> tuple[list[CameraModel], list[Picture]]:
     """Opportunity's five frames as 8 bits, and their label models in the rover frame."""
-    products = [read_product(path) for path in sorted(MER.glob(PRODUCTS))]
-    cameras, pictures = [], []
-    for product in products:
-        assert product.camera_model is not None and product.image is not None
-        cameras.append(product.camera_model)
-        pictures.append(np.clip(product.image * GREY_OF_12_BITS, 0, 255).astype(np.uint8))
-    return cameras, pictures
+    products: list[Any] = [read_product(path) for path in sorted(MER.glob(PRODUCTS))]
+    pictures = [np.clip(one.image / 16.0, 0, 255).astype(np.uint8) for one in products]  # of 12 bits
+    return [one.camera_model for one in products], pictures
 
 
 def ours(canvas: Canvas, cameras: list[CameraModel], pictures: list[Picture]) -> tuple[dict[str, Any], Any]:
