@@ -141,6 +141,7 @@ class Walk:
     "name",
     [
         pytest.param("first-pointing", marks=pytest.mark.long(1, "a tutorial: a daemon and three pointings")),
+        pytest.param("panorama", marks=pytest.mark.long(1, "a tutorial: a panorama and three pointings")),
         pytest.param("servos-to-verdict", marks=pytest.mark.long(2, "a tutorial: a bench by servo bytes")),
         pytest.param(
             "first-ci-test", marks=pytest.mark.long(3, "a tutorial: pytest on a project of its own")

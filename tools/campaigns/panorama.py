@@ -68,7 +68,7 @@ def found_in(task: Scene) -> Found:
             seams = (*folder.index.whole.rms_px, *folder.index.whole.across_px)
             true = true_angles(folder, rover)  # the simulator forgets them
             clicks = [click(client, rover, folder, true, rng) for _ in range(task.cases)]
-            slips = [slipped(client, folder, rover, axis) for axis in (0, 1)] if task.number == 0 else []
+            slips = [slipped(client, folder, axis) for axis in (0, 1)] if task.number == 0 else []
     return Found(clicks, seams, slips)
 
 
@@ -118,8 +118,8 @@ def random_pixel(
             return (x, y), seen.view, point
 
 
-def slipped(client: Client, before: Folder, rover: RoverModel, axis: int) -> str:
-    """What the seams say where a reading is off from the middle view on: a resumed panorama."""
+def slipped(client: Client, before: Folder, axis: int) -> str:
+    """What the seams say where a reading is off from the middle view on."""
     half = len(before.index.views) // 2
     operation = client.take_panorama(pair="navcam", **FIELD)
     name = str(client.operation(operation)["request"]["panorama"])
@@ -129,9 +129,8 @@ def slipped(client: Client, before: Folder, rover: RoverModel, axis: int) -> str
     client.wait(operation, timeout_s=WAITED_S)
     client.clear_faults()
     slip = client.panorama(name).get("slip")
-    return f"{('pan', 'tilt')[axis]} {1e3 * SLIP_RAD:+.2f} mrad: " + (
-        "none" if slip is None else slip["sentence"]
-    )
+    sentence = "none" if slip is None else slip["sentence"]
+    return f"{('pan', 'tilt')[axis]} {1e3 * SLIP_RAD:+.2f} mrad: {sentence}"
 
 
 COLUMNS = {
