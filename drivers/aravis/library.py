@@ -1,7 +1,7 @@
 """The C library Aravis by ctypes: only what this driver calls, and its errors as Python's.
 
 It is bound and not imported by GObject introspection, which would need the system's own Python
-(docs/decisions/libraries.md). A call lets go of Python's lock while it lasts.
+(docs/decisions/design.md). A call lets go of Python's lock while it lasts.
 """
 
 from __future__ import annotations
