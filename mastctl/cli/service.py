@@ -133,7 +133,7 @@ def _ready(client: Client, wait_s: float) -> Status:
     """
     from mastctl.answers.kinds import WELL
     from mastctl.client import ClientError
-    from mastctl.client.following import PASSING
+    from mastctl.client.connection import PASSING
 
     until_s = time.monotonic() + wait_s
     while True:

@@ -5,34 +5,21 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, cast
 
-from mastctl.answers import (
-    EstopTold,
-    Event,
-    OperationListed,
-    Operations,
-    OperationTold,
-    PoseTaken,
-    Preview,
-    ResetTold,
-    Started,
-    StateTold,
-    Status,
-    Step,
-    StopTold,
-    TrackTold,
-)
-from mastctl.client.connection import ClientError, DaemonHttp, escaped, floats, given
-from mastctl.client.following import PASSING, followed
+from mastctl import answers
+from mastctl.client.calls import Calls
+from mastctl.client.connection import PASSING, ClientError, DaemonHttp, escaped, followed, given
 from mastctl.client.jog import ANSWER_S, Jog
-from mastctl.client.keeping_calls import KeepingCalls
 from mastctl.client.lease import LeaseCalls
-from mastctl.client.panorama_calls import PanoramaCalls
-from mastctl.client.simulation_calls import SimulationCalls
-from mastctl.client.snapshot import Snapshot, read_snapshot
+from mastctl.frame_facts import FrameFacts, facts_in
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from mastctl.client.pictures import LivePictures
 
 ENDED = ("done", "failed", "stopped")
@@ -40,7 +27,42 @@ STOP_ANSWER_S = 5.0  # the daemon answers a stop within 3 s
 DEFAULT_URL = "http://127.0.0.1:8420"
 
 
-class Client(LeaseCalls, KeepingCalls, PanoramaCalls, SimulationCalls):
+@dataclass(frozen=True, eq=False)
+class Snapshot(FrameFacts):
+    """A picture and its facts; ``data`` is the file as it came."""
+
+    data: bytes
+
+    @cached_property
+    def image(self) -> NDArray[np.uint8]:
+        """The decoded picture, uint8 of (h, w) or (h, w, 3) in the order blue, green, red.
+
+        Raises ImportError without OpenCV, which ``mastctl-client`` leaves to you, ValueError if it cannot be
+        decoded.
+        """
+        try:
+            import cv2
+            import numpy as np
+        except ImportError as missing:
+            raise ImportError(
+                "decoding a picture needs opencv-python-headless (pip install opencv-python-headless); "
+                "`data` has the picture's file without it",
+                name=missing.name,
+            ) from None
+        image = cv2.imdecode(np.frombuffer(self.data, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise ValueError("the picture cannot be decoded")
+        return np.asarray(image, dtype=np.uint8)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Everything but the picture, as JSON."""
+        height, width = self.image.shape[:2]
+        names = (one.name for one in fields(FrameFacts))
+        return {name: getattr(self, name) for name in names} | {"size_px": [width, height]}
+
+
+class Client(LeaseCalls, Calls):
     """A connection to one daemon. A context manager; usable from one thread at a time.
 
     Parameters
@@ -75,12 +97,12 @@ class Client(LeaseCalls, KeepingCalls, PanoramaCalls, SimulationCalls):
         self.reads_only = reads_only
         self.daemon = DaemonHttp(url, timeout_s, name, token, reads_only)
 
-    def status(self, timeout_s: float | None = None) -> Status:
+    def status(self, timeout_s: float | None = None) -> answers.Status:
         """Return what the daemon knows now; ``timeout_s`` shortens the longest time of this request.
 
         Another program's answer is ``bad_answer``.
         """
-        status = self.daemon.json(Status, "GET", "/status", within_s=timeout_s)
+        status = self.daemon.json(answers.Status, "GET", "/status", within_s=timeout_s)
         if not isinstance(status.get("state"), str) or "mast" not in status:
             raise self.daemon.bad_answer("its status has no state, or no mast")
         return status
@@ -103,16 +125,12 @@ class Client(LeaseCalls, KeepingCalls, PanoramaCalls, SimulationCalls):
     ) -> str:
         """Start a pointing operation and return its id.
 
+        The target is one of: ``pixel`` (camera, frame id, x, y); ``position_m`` (x, y, z) in the ``rover``
+        (default) or ``site`` frame; ``panorama``, a pixel of one: ``id``, ``x_px``, ``y_px``, perhaps
+        ``recompute``, ``by_direction``; the joint angles.
+
         Parameters
         ----------
-        pixel
-            (camera, frame id, x, y), pixels; or
-        position_m, frame
-            a point, metres, in the ``rover`` (default) or ``site`` frame; or
-        panorama
-            a panorama's pixel: ``id``, ``x_px``, ``y_px``, perhaps ``recompute``, ``by_direction``; or
-        pan_rad, tilt_rad
-            joint angles.
         aim
             (camera, x, y): where the target shall come; the daemon's default when left out.
         pointings
@@ -123,13 +141,13 @@ class Client(LeaseCalls, KeepingCalls, PanoramaCalls, SimulationCalls):
             camera is not used then.
         deadline_s
             How long it is given, seconds of the daemon's clock; then the head is stopped and the operation
-            fails with ``deadline_passed``. By default from the longest way and the speed.
+            fails with ``deadline_passed``. By default from the longest move and the speed.
         idempotency_key
             The same for each try of one command; a new one by default.
         """
         body = given(
             **_target(pixel, position_m, frame, aim, range_m, plane),
-            panorama=None if panorama is None else dict(panorama),
+            panorama=panorama,
             pan_rad=pan_rad,
             tilt_rad=tilt_rad,
             pointings=pointings,
@@ -139,9 +157,9 @@ class Client(LeaseCalls, KeepingCalls, PanoramaCalls, SimulationCalls):
     def _started(
         self, path: str, body: dict[str, Any] | None, key: str | None, deadline_s: float | None
     ) -> str:
-        return self.daemon.command(Started, "POST", path, body, key=key, deadline_s=deadline_s)["id"]
+        return self.daemon.command(answers.Started, "POST", path, body, key=key, deadline_s=deadline_s)["id"]
 
-    def turn(self, pan_rad: float, tilt_rad: float, timeout_s: float = 90.0) -> OperationTold:
+    def turn(self, pan_rad: float, tilt_rad: float, timeout_s: float = 90.0) -> answers.OperationTold:
         """Turn to joint angles as the head reads them; return the operation's record when it has ended.
 
         A turn that this program cannot follow any more, or whose time is over, is stopped. ``timeout_s`` is
@@ -168,7 +186,7 @@ class Client(LeaseCalls, KeepingCalls, PanoramaCalls, SimulationCalls):
         aim: tuple[str, float, float] | None = None,
         range_m: float | None = None,
         plane: Mapping[str, Sequence[float]] | None = None,
-    ) -> Preview:
+    ) -> answers.Preview:
         """Return what a pixel (camera, frame id, x, y) shows and where `point` would send the head.
 
         Nothing moves. ``position_m`` with ``sigma_m``, ``range_m``, the match in the other camera,
@@ -176,31 +194,31 @@ class Client(LeaseCalls, KeepingCalls, PanoramaCalls, SimulationCalls):
         `point`.
         """
         body = _target(pixel, None, None, aim, range_m, plane)
-        return self.daemon.json(Preview, "POST", "/point/preview", json=body)
+        return self.daemon.json(answers.Preview, "POST", "/point/preview", json=body)
 
-    def operation(self, operation_id: str, timeout_s: float | None = None) -> OperationTold:
+    def operation(self, operation_id: str, timeout_s: float | None = None) -> answers.OperationTold:
         """Return an operation's record; ``timeout_s`` as of `status`."""
         return self.daemon.json(
-            OperationTold, "GET", f"/operations/{escaped(operation_id)}", within_s=timeout_s
+            answers.OperationTold, "GET", f"/operations/{escaped(operation_id)}", within_s=timeout_s
         )
 
-    def operations(self) -> list[OperationListed]:
+    def operations(self) -> list[answers.OperationListed]:
         """Return the newest operations, newest first, without their steps."""
-        return self.daemon.json(Operations, "GET", "/operations")["operations"]
+        return self.daemon.json(answers.Operations, "GET", "/operations")["operations"]
 
-    def stop_operation(self, operation_id: str) -> OperationTold:
+    def stop_operation(self, operation_id: str) -> answers.OperationTold:
         """Stop the mast and one operation, if it still runs; what another client began goes on.
 
         Returns its record, which may not have ended yet.
         """
-        return self.daemon.json(OperationTold, "POST", f"/operations/{escaped(operation_id)}/stop")
+        return self.daemon.json(answers.OperationTold, "POST", f"/operations/{escaped(operation_id)}/stop")
 
     def wait(
         self,
         operation_id: str,
         timeout_s: float = 60.0,
-        on_step: Callable[[Step], None] | None = None,
-    ) -> OperationTold:
+        on_step: Callable[[answers.Step], None] | None = None,
+    ) -> answers.OperationTold:
         """Wait until an operation has ended (done, failed or stopped) and return its record.
 
         ``on_step`` is called with each step as it comes. Raises ClientError ``timeout`` if it has not ended
@@ -223,8 +241,8 @@ class Client(LeaseCalls, KeepingCalls, PanoramaCalls, SimulationCalls):
         self,
         *states: str,
         timeout_s: float = 60.0,
-        on_change: Callable[[Status | StateTold], None] | None = None,
-    ) -> Status | StateTold:
+        on_change: Callable[[answers.Status | answers.StateTold], None] | None = None,
+    ) -> answers.Status | answers.StateTold:
         """Wait until the daemon's state is one of these; return it with what goes with it in the status.
 
         ``on_change`` is called with the same at the beginning and at each change. Raises ClientError
@@ -240,26 +258,26 @@ class Client(LeaseCalls, KeepingCalls, PanoramaCalls, SimulationCalls):
         wanted = " or ".join(states)
         raise ClientError("timeout", f"the state is {state} and not {wanted} after {timeout_s:g} s")
 
-    def events(self, *topics: str, keys: Sequence[str] = ()) -> Generator[Event, None, None]:
+    def events(self, *topics: str, keys: Sequence[str] = ()) -> Generator[answers.Event, None, None]:
         """Yield each change of some topics (all without any) and keys, beginning with what is known, until
         the daemon ends: ``topic``, ``key``, ``sequence``, ``lost``, ``value``.
         """
         query = given(key=list(keys) or None, topics=",".join(topics) or None)
         for event in self.daemon.heard("/events", query):
             if event is not None:
-                yield cast(Event, event)
+                yield cast(answers.Event, event)
 
-    def stop(self) -> StopTold:
+    def stop(self) -> answers.StopTold:
         """Stop the mast and the running operation."""
-        return self.daemon.json(StopTold, "POST", "/stop")
+        return self.daemon.json(answers.StopTold, "POST", "/stop")
 
-    def estop(self, *, reason: str | None = None, name: str | None = None) -> EstopTold:
+    def estop(self, *, reason: str | None = None, name: str | None = None) -> answers.EstopTold:
         """Stop the mast and let nothing move it until `reset`; ``kept`` says whether a restart would know."""
-        return self.daemon.json(EstopTold, "POST", "/estop", json=given(reason=reason, name=name))
+        return self.daemon.json(answers.EstopTold, "POST", "/estop", json=given(reason=reason, name=name))
 
-    def reset(self, *, reason: str, name: str) -> ResetTold:
+    def reset(self, *, reason: str, name: str) -> answers.ResetTold:
         """Release the emergency stop; a later command moves again."""
-        return self.daemon.json(ResetTold, "POST", "/reset", json={"reason": reason, "name": name})
+        return self.daemon.json(answers.ResetTold, "POST", "/reset", json={"reason": reason, "name": name})
 
     def pose(
         self,
@@ -270,37 +288,28 @@ class Client(LeaseCalls, KeepingCalls, PanoramaCalls, SimulationCalls):
         sigma: tuple[float, float] | None = None,
         time_s: float | None = None,
         look: bool = True,
-    ) -> PoseTaken:
+    ) -> answers.PoseTaken:
         """Say where the rover stands; return the track as it is then, and the ``operation`` of a look.
 
-        Parameters
-        ----------
-        position_m, quaternion
-            site_from_rover: (x, y, z), metres, and (w, x, y, z).
-        covariance
-            6 rows of 6 of the motion since the pose before, along the rover's axes of this pose: x, y, z in
-            metres, then the turns about them in radians; or
-        sigma
-            (metres, radians): one sigma of each axis of its translation and of its rotation.
-        time_s
-            By the sender's clock.
-        look
-            Whether a track's target shall be looked for.
+        ``position_m`` (x, y, z) and ``quaternion`` (w, x, y, z) are site_from_rover. How well the motion
+        since the pose before is known: ``covariance``, (6, 6) along the rover's axes of this pose, x, y, z in
+        metres and the turns about them in radians; or ``sigma`` (metres, radians) of each axis of its
+        translation and of its rotation. ``time_s`` is by the sender's clock; ``look``: whether a track's
+        target shall be looked for.
         """
-        motion = None if sigma is None else {"position_m": sigma[0], "rotation_rad": sigma[1]}
         body = given(
-            position_m=floats(position_m),
-            quaternion=floats(quaternion),
-            covariance=None if covariance is None else [floats(row) for row in covariance],
-            sigma=motion,
+            position_m=position_m,
+            quaternion=quaternion,
+            covariance=covariance,
+            sigma=None if sigma is None else {"position_m": sigma[0], "rotation_rad": sigma[1]},
             time_s=time_s,
             look=look,
         )
-        return self.daemon.json(PoseTaken, "POST", "/pose", json=body)
+        return self.daemon.json(answers.PoseTaken, "POST", "/pose", json=body)
 
-    def track(self, timeout_s: float | None = None) -> TrackTold:
+    def track(self, timeout_s: float | None = None) -> answers.TrackTold:
         """Return the track as it is; ``timeout_s`` as of `status`."""
-        return self.daemon.json(TrackTold, "GET", "/track", within_s=timeout_s)
+        return self.daemon.json(answers.TrackTold, "GET", "/track", within_s=timeout_s)
 
     def start_track(
         self,
@@ -322,8 +331,8 @@ class Client(LeaseCalls, KeepingCalls, PanoramaCalls, SimulationCalls):
         self,
         operation_id: str | None,
         timeout_s: float = 60.0,
-        on_step: Callable[[Step], None] | None = None,
-    ) -> TrackTold:
+        on_step: Callable[[answers.Step], None] | None = None,
+    ) -> answers.TrackTold:
         """Wait until a start or a look of the track has ended; return the track after it.
 
         ``None`` for the operation returns the track as it is. Raises ClientError as `wait`.
@@ -335,15 +344,15 @@ class Client(LeaseCalls, KeepingCalls, PanoramaCalls, SimulationCalls):
                 return track
         raise ClientError("timeout", f"the track did not take up operation {operation_id}")
 
-    def watch_track(self) -> Generator[TrackTold, None, None]:
+    def watch_track(self) -> Generator[answers.TrackTold, None, None]:
         """Yield the track as it is, and again at each change, until the daemon ends."""
         for track in self.daemon.heard("/track/stream"):
             if track is not None:
-                yield cast(TrackTold, track)
+                yield cast(answers.TrackTold, track)
 
-    def stop_track(self) -> TrackTold:
+    def stop_track(self) -> answers.TrackTold:
         """End the track; return it as it is then."""
-        return self.daemon.json(TrackTold, "POST", "/track/stop")
+        return self.daemon.json(answers.TrackTold, "POST", "/track/stop")
 
     def jog(self) -> Jog:
         """Return a context in which the head turns at rates; it sends the heartbeats itself.
@@ -386,19 +395,15 @@ class Client(LeaseCalls, KeepingCalls, PanoramaCalls, SimulationCalls):
     ) -> Snapshot:
         """Return a picture with its facts; ``png`` is lossless.
 
-        Parameters
-        ----------
-        fresh
-            Whether it must be exposed after the daemon got the request; else it is at most a second old.
-        frame_id
-            A frame that the daemon still keeps, instead of a new one.
+        ``fresh``: it is exposed after the daemon got the request, else it is at most a second old.
+        ``frame_id`` names a frame that the daemon still keeps, instead of a new one.
         """
         kept = {"fresh": "true" if fresh else "false"} if frame_id is None else {"frame_id": frame_id}
         answer = self.daemon.request("GET", f"/snapshot/{escaped(camera)}", params={"format": format, **kept})
         try:
-            return read_snapshot(answer.content, answer.headers)
-        except ValueError as reason:
-            raise self.daemon.bad_answer(str(reason)) from None
+            return Snapshot(data=answer.content, **facts_in(answer.headers))
+        except (KeyError, ValueError) as reason:
+            raise self.daemon.bad_answer(f"the picture's facts are wrong: {reason}") from None
 
     def close(self) -> None:
         """Let go of the connection."""
@@ -423,9 +428,9 @@ def _target(
     names = ("camera", "frame_id", "x_px", "y_px")
     return given(
         pixel=None if pixel is None else dict(zip(names, pixel, strict=True)),
-        position_m=None if position_m is None else floats(position_m),
+        position_m=position_m,
         frame=frame,
         aim=None if aim is None else dict(zip(("camera", "x_px", "y_px"), aim, strict=True)),
         range_m=range_m,
-        plane=None if plane is None else {key: list(values) for key, values in plane.items()},
+        plane=plane,
     )

@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable
 
-from mastctl.answers import JogAnswer, OperationTold
+from mastctl import answers
 from mastctl.client.connection import ClientError, DaemonHttp, escaped, given
 
 BEAT_S = 0.12  # the daemon waits 0.5 s: three may get lost
@@ -91,7 +91,7 @@ class Jog:
             return
         self._sequence += 1
         body = given(pan_rad_per_s=rates[0], tilt_rad_per_s=rates[1], sequence=self._sequence, id=self._id)
-        answer = self._daemon.json(JogAnswer, "POST", "/jog", json=body)
+        answer = self._daemon.json(answers.JogAnswer, "POST", "/jog", json=body)
         self._id, self._held = answer["id"], answer["held"]
         if rates == (0.0, 0.0) and self._id is not None:
             self._wait_ended(self._id)
@@ -102,6 +102,6 @@ class Jog:
         until_s = time.monotonic() + ANSWER_S
         while time.monotonic() < until_s:
             path = f"/operations/{escaped(jog)}"
-            if self._daemon.json(OperationTold, "GET", path)["state"] not in ("queued", "running"):
+            if self._daemon.json(answers.OperationTold, "GET", path)["state"] not in ("queued", "running"):
                 return
             time.sleep(POLL_S)

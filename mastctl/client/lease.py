@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from mastctl.answers import ControlTold, LeaseGranted, LeaseTold
+from mastctl import answers
 from mastctl.client.connection import Broken, ClientError, DaemonHttp, given, plain_name
 
 RENEWALS = 3  # within a lease's time, so that one may be lost
@@ -21,7 +21,7 @@ class HeldLease:
     ``lost``: why the lease is over, None while it lasts; the next command is refused with the same reason.
     """
 
-    def __init__(self, daemon: DaemonHttp, granted: LeaseGranted, for_s: float) -> None:
+    def __init__(self, daemon: DaemonHttp, granted: answers.LeaseGranted, for_s: float) -> None:
         self.id = str(granted["lease_id"])
         self.holder = str(granted["holder"])
         self.lost: ClientError | None = None
@@ -41,7 +41,7 @@ class HeldLease:
         self._thread.join()
         if self.lost is None:
             with contextlib.suppress(ClientError):
-                self._daemon.json(LeaseTold, "DELETE", "/lease")
+                self._daemon.json(answers.LeaseTold, "DELETE", "/lease")
         self._daemon.close()
 
     def _renew(self) -> None:
@@ -50,7 +50,7 @@ class HeldLease:
             sent_s = time.monotonic()
             try:
                 renewal = {"for_s": self._for_s}
-                self._daemon.json(LeaseGranted, "POST", "/lease/renew", json=renewal)
+                self._daemon.json(answers.LeaseGranted, "POST", "/lease/renew", json=renewal)
                 self._until_s = sent_s + self._for_s
             except ClientError as error:
                 passing = isinstance(error, Broken) or error.code in ("no_daemon", "timeout")
@@ -78,17 +78,10 @@ class LeaseCalls:
         A motion that still runs when the lease ends, by the block's end too, is stopped: wait for it. Raises
         ClientError ``leased`` if another client steers.
 
-        Parameters
-        ----------
-        name
-            The holder's, by default this client's.
-        for_s
-            How long it outlives a holder that falls silent, 1 to 3600 s.
-        take_over
-            The reason for taking it from the client that steers; None neither waits nor takes it away.
-        ends_with_stop
-            Whether it ends with the next stop of the head: for a program that would go on with its next move
-            otherwise.
+        ``name`` is the holder's, by default this client's; the lease outlives a holder that falls silent by
+        ``for_s``, 1 to 3600 s. ``take_over``: the reason for taking it from the client that steers.
+        ``ends_with_stop``: it ends with the next stop of the head, for a program that would go on with its
+        next move otherwise.
         """
         granted = self.acquire_lease(name, for_s, take_over, ends_with_stop)
         before, held = self.daemon.lease_id, HeldLease(self.daemon, granted, for_s)
@@ -99,9 +92,9 @@ class LeaseCalls:
             self.daemon.lease_id = before
             held.end()
 
-    def control(self) -> ControlTold | None:
+    def control(self) -> answers.ControlTold | None:
         """Return the client that steers, or None."""
-        return self.daemon.json(LeaseTold, "GET", "/lease")["control"]
+        return self.daemon.json(answers.LeaseTold, "GET", "/lease")["control"]
 
     def acquire_lease(
         self,
@@ -109,24 +102,24 @@ class LeaseCalls:
         for_s: float = 30.0,
         take_over: str | None = None,
         ends_with_stop: bool = False,
-    ) -> LeaseGranted:
+    ) -> answers.LeaseGranted:
         """Acquire or take over a lease that is not renewed; arguments as for `lease`.
 
         Returns ``lease_id``, ``holder``, ``for_s`` and ``until``; `use_lease` has commands carry it.
         """
         body = given(for_s=float(for_s), ends_with_stop=ends_with_stop or None, name=name, reason=take_over)
         path = "/lease" if take_over is None else "/lease/take"
-        return self.daemon.command(LeaseGranted, "POST", path, body)
+        return self.daemon.command(answers.LeaseGranted, "POST", path, body)
 
     def use_lease(self, lease_id: str | None) -> None:
         """Have each command carry a lease from now on, or none."""
         self.daemon.lease_id = None if lease_id is None else plain_name(lease_id)
 
-    def renew_lease(self, for_s: float | None = None) -> LeaseGranted:
+    def renew_lease(self, for_s: float | None = None) -> answers.LeaseGranted:
         """Have the lease in use run for ``for_s`` seconds from now on, by default as long as at first."""
         body = given(for_s=None if for_s is None else float(for_s))
-        return self.daemon.command(LeaseGranted, "POST", "/lease/renew", body)
+        return self.daemon.command(answers.LeaseGranted, "POST", "/lease/renew", body)
 
     def release_lease(self) -> None:
         """Release the lease in use."""
-        self.daemon.command(LeaseTold, "DELETE", "/lease")
+        self.daemon.command(answers.LeaseTold, "DELETE", "/lease")

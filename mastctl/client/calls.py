@@ -1,0 +1,351 @@
+"""Requests of a client that neither point nor track: what a daemon keeps, panoramas, a simulated rover."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+from mastctl import answers
+from mastctl.client.connection import DaemonHttp, escaped, given
+
+
+class Calls:
+    """Configuration, mast files, recordings, places, benches, panoramas, targets; of a simulated rover its
+    true pose, boards, time and faults.
+    """
+
+    daemon: DaemonHttp
+
+    def reload(self) -> answers.ReloadResult:
+        """Have the daemon read its configuration again: all of it comes into use while the head rests, or
+        nothing (``restart_needed``, ``bad_config``, ``bad_mast_file``, ``busy``, ``moving``).
+        """
+        return self.daemon.command(answers.ReloadResult, "POST", "/reload")
+
+    def live(self) -> answers.LiveTold:
+        """Return that the daemon answers; needs no token."""
+        return self.daemon.json(answers.LiveTold, "GET", "/health/live")
+
+    def calibration_health(self) -> answers.CalibrationReport:
+        """Return whether residuals of the last days are as the mast file predicts, with the figures."""
+        return self.daemon.json(answers.CalibrationReport, "GET", "/calibration/health")
+
+    def sentinel(self) -> answers.SentinelTold:
+        """Return what the drift sentinel in the daemon's state folder has found, and how long ago."""
+        return self.daemon.json(answers.SentinelTold, "GET", "/sentinel")
+
+    def rig(self) -> answers.RigSummary:
+        """Return the configured cameras by the mast file in use: where each looks and how much it sees."""
+        return self.daemon.json(answers.RigSummary, "GET", "/rig")
+
+    def camera_settings(self, camera: str) -> answers.CameraSettingsTold:
+        """Return what of a camera can be changed: ``settings`` with bounds, and whether they are ``held``."""
+        return self.daemon.json(answers.CameraSettingsTold, "GET", f"/cameras/{escaped(camera)}/settings")
+
+    def set_camera(
+        self,
+        camera: str,
+        *,
+        exposure_s: float | None = None,
+        gain: float | None = None,
+        white_balance_k: float | None = None,
+        focus: float | None = None,
+    ) -> answers.CameraSettingsTold:
+        """Change some of a camera's settings and return all as they are then.
+
+        The automatic of each is turned off. ``notes`` has a sentence for each that became another value. They
+        hold until the daemon ends, also for a camera that is unplugged meanwhile. Each picture's
+        facts have those that it was taken with.
+        """
+        body = given(exposure_s=exposure_s, gain=gain, white_balance_k=white_balance_k, focus=focus)
+        path = f"/cameras/{escaped(camera)}/settings"
+        return self.daemon.command(answers.CameraSettingsTold, "PATCH", path, body)
+
+    def bench(self) -> answers.BenchRuns:
+        """Return the bench calibration at work or the last one (``run``), and those that are kept."""
+        return self.daemon.json(answers.BenchRuns, "GET", "/bench")
+
+    def begin_bench(
+        self,
+        board: str | None = None,
+        *,
+        board_file: str | None = None,
+        resume: str | None = None,
+        wanted_px: float | None = None,
+        pictures: int | None = None,
+        by_hand: bool | None = None,
+    ) -> answers.BenchRunRecord:
+        """Have the daemon begin a bench calibration, or go on with one, and return it as it is then.
+
+        ``board`` names a packaged one, ``board_file`` is the text of a BOARD.yaml, ``resume`` names a run:
+        one of them is expected. ``wanted_px`` is the error that the calibration may leave of a first
+        pointing, rms an axis (by default 0.2), ``pictures`` the most of each camera (60). ``by_hand``: a
+        simulated board waits for `board_stands` too, as a real one does.
+        """
+        body = given(
+            board=board,
+            board_file=board_file,
+            resume=resume,
+            wanted_px=wanted_px,
+            pictures=pictures,
+            by_hand=by_hand,
+        )
+        return self.daemon.command(answers.BenchAnswer, "POST", "/bench", body)["run"]
+
+    def board_stands(self) -> answers.BenchRunRecord:
+        """Confirm that the board is at the requested placement."""
+        return self.daemon.command(answers.BenchAnswer, "POST", "/bench/stands")["run"]
+
+    def leave_bench(self) -> answers.BenchRunRecord:
+        """End the bench calibration; it can go on later (`begin_bench`, ``resume``)."""
+        return self.daemon.command(answers.BenchAnswer, "POST", "/bench/leave")["run"]
+
+    def forget_bench(self, name: str) -> answers.BenchRuns:
+        """Remove a bench calibration that is over, with its pictures and report; its mast file stays.
+
+        Returns what is left, as `bench`. Refused with ``bench_runs``, ``bench_unknown``, ``unwritable``.
+        """
+        return self.daemon.command(answers.BenchRuns, "DELETE", f"/bench/runs/{escaped(name)}")
+
+    def reports(self) -> answers.ReportList:
+        """Return the reports that can be read, the newest first."""
+        return self.daemon.json(answers.ReportList, "GET", "/reports")
+
+    def report(self, name: str) -> bytes:
+        """Return a report, HTML."""
+        return self.daemon.request("GET", f"/reports/{escaped(name)}").content
+
+    def recordings(self) -> answers.Recordings:
+        """Return the daemon's recordings, and what it records now."""
+        return self.daemon.json(answers.Recordings, "GET", "/recordings")
+
+    def start_recording(self, name: str = "") -> answers.RecorderState:
+        """Have the daemon record until `stop_recording`; return what it records then."""
+        return self.daemon.command(answers.RecorderState, "POST", "/recordings/start", {"name": name})
+
+    def stop_recording(self) -> answers.RecordingEnded:
+        """End the recording; return its file on the daemon's machine, its size and what was dropped."""
+        return self.daemon.command(answers.RecordingEnded, "POST", "/recordings/stop")
+
+    def recording(self, name: str, file: str) -> bytes:
+        """Return a file of a recording whole, by the names that `recordings` returns."""
+        path = f"/recordings/{escaped(name)}/{escaped(file)}"
+        return self.daemon.request("GET", path).content
+
+    def delete_recording(self, name: str) -> answers.RecordingDeleted:
+        """Delete a run, or what was kept at a fault; return what is left."""
+        return self.daemon.command(answers.RecordingDeleted, "DELETE", f"/recordings/{escaped(name)}")
+
+    def mast_file(self) -> bytes:
+        """Return the mast file that the daemon uses, byte for byte."""
+        return self.daemon.request("GET", "/mast").content
+
+    def use_mast(self, file: str) -> answers.MastChange:
+        """Use another mast file of the same folder; return which is in use now, and the former one."""
+        return self.daemon.command(answers.MastChange, "POST", "/mast", {"file": file})
+
+    def use_former_mast(self) -> answers.MastChange:
+        """Go back to the mast file that was in use before; return which is in use now, and the former one."""
+        return self.daemon.command(answers.MastChange, "POST", "/mast/back")
+
+    def places(self) -> dict[str, answers.HeadPlace]:
+        """Return the places of the head that are kept, by name; ``home`` is always among them."""
+        return self.daemon.json(answers.PlaceList, "GET", "/places")["places"]
+
+    def keep_place(self, name: str, pan_rad: float, tilt_rad: float) -> dict[str, answers.HeadPlace]:
+        """Keep a place of the head by a name, for everybody; return all."""
+        body = {"pan_rad": pan_rad, "tilt_rad": tilt_rad}
+        return self.daemon.command(answers.PlaceList, "POST", f"/places/{escaped(name)}", body)["places"]
+
+    def forget_place(self, name: str) -> dict[str, answers.HeadPlace]:
+        """Forget a place; return those that are left. Raises ClientError ``place_unknown``."""
+        return self.daemon.command(answers.PlaceList, "DELETE", f"/places/{escaped(name)}")["places"]
+
+    def sun(self) -> answers.SunTold:
+        """Return the direction that no head camera looks into: ``sun``, null where none was stated."""
+        return self.daemon.json(answers.SunTold, "GET", "/limits/sun")
+
+    def keep_off_sun(
+        self,
+        azimuth_rad: float,
+        elevation_rad: float,
+        half_angle_rad: float,
+        *,
+        frame: Literal["site", "rover"] = "site",
+        valid_s: float | None = None,
+    ) -> answers.SunTold:
+        """Say where the sun stands: azimuth from north over east (forward over right), elevation up.
+
+        ``half_angle_rad``: how near a head camera's axis may come; ``valid_s``: how long that holds, seconds,
+        by default until another is stated.
+        """
+        body = given(
+            azimuth_rad=azimuth_rad,
+            elevation_rad=elevation_rad,
+            half_angle_rad=half_angle_rad,
+            frame=frame,
+            valid_s=valid_s,
+        )
+        return self.daemon.command(answers.SunTold, "POST", "/limits/sun", body)
+
+    def forget_sun(self) -> answers.SunTold:
+        """Keep the head off no sun any more."""
+        return self.daemon.command(answers.SunTold, "DELETE", "/limits/sun")
+
+    def session(self) -> answers.ClientSession:
+        """Return this client's ``name``, ``role`` and ``via``, and whether the daemon requires a token."""
+        return self.daemon.json(answers.ClientSession, "GET", "/session")
+
+    def take_panorama(
+        self,
+        *,
+        pair: str | None = None,
+        camera: str | None = None,
+        pan_rad: Sequence[float] | None = None,
+        tilt_rad: Sequence[float] | None = None,
+        overlap: float | None = None,
+        exposure: Literal["first", "auto-per-view"] | None = None,
+        resume: str | None = None,
+    ) -> str:
+        """Start to take a panorama and return the operation's id; its record names the panorama.
+
+        ``pan_rad``, ``tilt_rad``: azimuth and elevation of the field, from and to. ``resume`` names one of
+        which views are missing, and goes alone.
+        """
+        body = given(
+            pair=pair,
+            camera=camera,
+            pan_rad=pan_rad,
+            tilt_rad=tilt_rad,
+            overlap=overlap,
+            exposure=exposure,
+            resume=resume,
+        )
+        return self.daemon.command(answers.Started, "POST", "/panoramas", body)["id"]
+
+    def panoramas(self) -> list[answers.PanoramaListed]:
+        """Return the daemon's panoramas, the newest first."""
+        return self.daemon.json(answers.PanoramaList, "GET", "/panoramas")["panoramas"]
+
+    def panorama(self, name: str) -> dict[str, Any]:
+        """Return a panorama's index (``mastctl/panorama/1``)."""
+        return self.daemon.json(dict[str, Any], "GET", f"/panoramas/{escaped(name)}")
+
+    def panorama_file(self, name: str, file: str) -> bytes:
+        """Return a file of a panorama: ``index.yaml``, ``mosaic.png``, a frame that the index names."""
+        return self.daemon.request("GET", f"/panoramas/{escaped(name)}/files/{file}").content
+
+    def targets(self) -> dict[str, answers.KeptTarget]:
+        """Return the targets that are kept, by name."""
+        return self.daemon.json(answers.TargetList, "GET", "/targets")["targets"]
+
+    def keep_target(
+        self,
+        name: str,
+        position_m: Sequence[float],
+        frame: Literal["rover", "site"] = "rover",
+        covariance_m2: Sequence[Sequence[float]] | None = None,
+    ) -> dict[str, answers.KeptTarget]:
+        """Keep a point by a name, for everybody, in the site frame if a pose is known; return all."""
+        body = given(position_m=position_m, frame=frame, covariance_m2=covariance_m2)
+        return self.daemon.command(answers.TargetList, "POST", f"/targets/{escaped(name)}", body)["targets"]
+
+    def forget_target(self, name: str) -> dict[str, answers.KeptTarget]:
+        """Forget a target; return those that are left. Raises ClientError ``target_unknown``."""
+        return self.daemon.command(answers.TargetList, "DELETE", f"/targets/{escaped(name)}")["targets"]
+
+    def true_pose(self) -> answers.TruePose:
+        """Return where a simulated rover truly stands: ``position_m`` and ``quaternion``, site_from_rover."""
+        return self.daemon.json(answers.TruePose, "GET", "/simulation/pose")
+
+    def stand(
+        self, x_m: float, y_m: float, heading_rad: float, pitch_rad: float = 0.0, roll_rad: float = 0.0
+    ) -> answers.TruePose:
+        """Put a simulated rover somewhere on its ground, truly; return its true pose."""
+        body = {"x_m": x_m, "y_m": y_m, "heading_rad": heading_rad}
+        body |= {"pitch_rad": pitch_rad, "roll_rad": roll_rad}
+        return self.daemon.command(answers.TruePose, "POST", "/simulation/pose", body)
+
+    def boards(self) -> dict[str, answers.BoardPose]:
+        """Return the boards held up before a simulated rover, by name: ``board``, ``position_m``,
+        ``quaternion`` (rover_from_board), ``bow_m``.
+        """
+        return self.daemon.json(answers.BoardList, "GET", "/simulation/boards")["boards"]
+
+    def put_board(
+        self,
+        name: str,
+        position_m: Sequence[float],
+        board: Mapping[str, Any] | None = None,
+        turned_rad: Sequence[float] | None = None,
+        quaternion: Sequence[float] | None = None,
+        bow_m: Sequence[float] | None = None,
+    ) -> answers.BoardPose:
+        """Hold a board up before a simulated rover, or move it; frames exposed from now on show it there.
+
+        ``position_m`` (3,) is that of its middle in the rover frame as the rover truly stands; ``board`` has
+        the contents of its BOARD.yaml, by default those of the present board of this name. ``turned_rad``:
+        turns about its own x, y and z after facing the mast upright (the upper edge nearer, the right edge
+        nearer, clockwise), or ``quaternion``: rover_from_board (w, x, y, z). ``bow_m``: how far its middle
+        stands out, across and down; by default as before, flat at first.
+        """
+        body = given(
+            position_m=position_m,
+            board=board,
+            turned_rad=turned_rad,
+            quaternion=quaternion,
+            bow_m=bow_m,
+        )
+        return self.daemon.command(answers.BoardPose, "POST", f"/simulation/boards/{escaped(name)}", body)
+
+    def take_board(self, name: str) -> None:
+        """Take a board away from a simulated rover."""
+        self.daemon.command(answers.BoardList, "DELETE", f"/simulation/boards/{escaped(name)}")
+
+    def simulation_time(self) -> answers.SimulationTime:
+        """Return a simulated rover's time: ``now_s``, and ``speed``, a number or ``max``."""
+        return self.daemon.json(answers.SimulationTime, "GET", "/simulation/time")
+
+    def advance(self, duration_s: float) -> answers.SimulationTime:
+        """Let time pass for a simulated rover whose ``simulation.speed`` is ``max``; return it then.
+
+        Raises ClientError ``time_passes`` where time passes by itself.
+        """
+        return self.daemon.command(
+            answers.SimulationTime, "POST", "/simulation/time", {"advance_s": duration_s}
+        )
+
+    def truth(
+        self,
+        frame_id: str,
+        *,
+        pixel: tuple[float, float] | None = None,
+        position_in_site_m: Sequence[float] | None = None,
+    ) -> answers.PointTruth:
+        """Return what a pixel (x, y) of a frame truly shows, or where a point of the site truly lies in it.
+
+        ``position_m`` is in the rover frame when the frame was taken; ``pixel_px`` null where the camera
+        could not see it, all three where a pixel shows the sky. Raises ClientError ``frame_too_old`` and
+        such.
+        """
+        x_px, y_px = pixel or (None, None)
+        x_m, y_m, z_m = (None, None, None) if position_in_site_m is None else position_in_site_m
+        query = given(frame_id=frame_id, x_px=x_px, y_px=y_px, x_m=x_m, y_m=y_m, z_m=z_m)
+        return self.daemon.json(answers.PointTruth, "GET", "/simulation/truth", params=query)
+
+    def fault_words(self) -> dict[str, dict[str, answers.FaultWord]]:
+        """Return the fault words of each simulated device: each one's ``effect``, and its ``parameters``."""
+        return self.daemon.json(answers.FaultWordList, "GET", "/simulation/words")["devices"]
+
+    def faults(self) -> list[answers.FaultSet]:
+        """Return the faults that are switched on in a simulated rover."""
+        return self.daemon.json(answers.FaultsSet, "GET", "/simulation/faults")["faults"]
+
+    def set_fault(self, /, device: str, word: str, **parameters: float) -> list[answers.FaultSet]:
+        """Switch a fault of a simulated device on; return all that are on."""
+        body = {"device": device, "word": word, "parameters": parameters}
+        return self.daemon.command(answers.FaultsSet, "POST", "/simulation/faults", body)["faults"]
+
+    def clear_faults(self, device: str | None = None) -> None:
+        """Switch the faults of one simulated device off, or all."""
+        self.daemon.command(answers.FaultsSet, "DELETE", "/simulation/faults", params=given(device=device))
