@@ -51,7 +51,8 @@ export class Eye {
     this.coarse = !facts.reduced ? "" : bitmap.width < width ? `, reduced to ${bitmap.width} × ${bitmap.height} px` : ", coarse";
     if (this.facts) this.intervals = [...this.intervals.slice(-4), facts.mid_exposure_s - this.facts.mid_exposure_s];
     this.facts = facts;
-    this.markTrack(facts.track);
+    this.draw("track", facts.track ? ellipse("track", facts.track) : null);
+    this.draw("targets", s("g", {}, Object.entries(facts.targets ?? {}).map(([name, place]) => ellipse("kept", place, name))));
     set(this.facing, "title", `frame ${facts.frame_id}, mast file ${facts.mast_digest.slice(0, 12)}`);
     this.fresh(performance.now());
     if (this.cursor) this.look(this.cursor);
@@ -213,14 +214,6 @@ export class Eye {
   mark(name, place, kind, words) {
     this.draw(name, place ? s("g", {}, cross(place[0], place[1], kind, 26), words ? s("text", { class: kind, x: place[0] + 14, y: place[1] - 14 }, words) : null) : null);
   }
-
-  markTrack(track) {
-    if (!track) return this.draw("track", null);
-    const { x_px: x, y_px: y } = track;
-    this.draw("track", s("g", {},
-      s("ellipse", { class: "track", rx: Math.max(3 * track.major_px, 4), ry: Math.max(3 * track.minor_px, 4), transform: `translate(${x} ${y}) rotate(${(track.turn_rad * 180) / Math.PI})` }),
-      cross(x, y, "track", 18)));
-  }
 }
 
 const ageOf = (facts, nowMs) => Math.max(0, (nowMs - facts.exposed_ms) / 1000);
@@ -233,7 +226,12 @@ export function ageWords(facts) {
 
 const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
 
-function cross(x, y, kind, size) {
+/** Where a target should be: one sigma thrice enlarged, a cross, and its name if it has one. */
+const ellipse = (kind, { x_px: x, y_px: y, major_px: major, minor_px: minor, turn_rad: turn }, name = null) => s("g", {},
+  s("ellipse", { class: kind, rx: Math.max(3 * major, 4), ry: Math.max(3 * minor, 4), transform: `translate(${x} ${y}) rotate(${(turn * 180) / Math.PI})` }),
+  cross(x, y, kind, 18), name === null ? null : s("text", { x: x + 14, y: y - 10 }, name));
+
+export function cross(x, y, kind, size) {
   const gap = size / 4;
   const d = `M${x - size} ${y}H${x - gap}M${x + gap} ${y}H${x + size}M${x} ${y - size}V${y - gap}M${x} ${y + gap}V${y + size}`;
   return s("g", {}, s("path", { class: "halo", d }), s("path", { class: kind, d }));

@@ -10,6 +10,7 @@ import { HeadPanel } from "./head.js";
 import { History } from "./history.js";
 import { Jog } from "./jog.js";
 import { OperationList } from "./operations.js";
+import { PanoramaPanel } from "./panorama.js";
 import { Reports } from "./reports.js";
 import { Residuals } from "./residuals.js";
 import { Settings } from "./settings.js";
@@ -73,6 +74,7 @@ function answered(dialog) {
 const events = new Events();
 const views = new Views((eye, pixel, facts, what) => (what === "track" ? track.begin(eye, pixel, facts) : target.choose(eye, pixel, facts)));
 const target = new Target(views, events, (words, urgent) => (urgent ? announce : speak)(words)); // seen in its panel
+const panorama = new PanoramaPanel(events, target, speak);
 const track = new TrackPanel(events, views, speak);
 const head = new HeadPanel(events);
 const jog = new Jog(alarm);
@@ -195,14 +197,14 @@ function show(status) {
   head.use(status, rig, views);
   jog.use(status.limits);
   mastFile.told(status, rig);
-  for (const part of [simulation, settings, track, target]) part.use(status, rig);
+  for (const part of [simulation, settings, track, target, panorama]) part.use(status, rig);
   set(document.body, "data-simulated", simulated);
 }
 
 function allow(role) {
   may = role !== "view";
   set(document.body, "data-role", role);
-  for (const part of [target, track, jog, control, recording, mastFile, simulation, settings, bench]) part.allow(may, role);
+  for (const part of [target, panorama, track, jog, control, recording, mastFile, simulation, settings, bench]) part.allow(may, role);
 }
 
 // Who one is

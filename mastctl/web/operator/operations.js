@@ -6,7 +6,7 @@ import { residualPicture } from "./residual.js";
 import { steps } from "./target.js";
 
 const SHOWN = 8;
-const ASKED = { pixel: "Point at a pixel", position_m: "Point at a position", pan_rad: "Turn to angles", track: "Begin a track", jog: "Turn by hand" };
+const ASKED = { panorama: "Point in a panorama", pixel: "Point at a pixel", position_m: "Point at a position", pan_rad: "Turn to angles", track: "Begin a track", jog: "Turn by hand" };
 
 export class OperationList {
   constructor(events) {
@@ -51,7 +51,7 @@ export class OperationList {
     const [what] = Object.keys(record.request ?? {});
     const result = record.residual_px ? `${record.residual_px.map((one) => number(one, 2, true)).join(", ")} px` : "";
     const place = h("details", { class: "operation", open: before?.place.open ?? false },
-      h("summary", {}, h("span", { class: `word ${record.state}` }, record.state), h("span", { class: "what" }, typeof record.request?.track === "string" ? "Look for the target" : ASKED[what] ?? what ?? ""), h("span", { class: "n" }, result)));
+      h("summary", {}, h("span", { class: `word ${record.state}` }, record.state), h("span", { class: "what" }, typeof record.request?.track === "string" ? "Look for the target" : typeof record.request?.panorama === "string" ? "Take a panorama" : ASKED[what] ?? what ?? ""), h("span", { class: "n" }, result)));
     const fill = () => { if (place.open && place.children.length === 1) place.append(this.whole(record)); };
     place.addEventListener("toggle", fill);
     fill();

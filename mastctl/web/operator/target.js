@@ -9,7 +9,7 @@ import { placeIn, shownBy } from "./truth.js";
 const STEPS = {
   rest: "the head rests", frames: "a fresh pair is taken", target: "the clicked point is found again", stereo: "found in the other camera", triangulate: "range",
   before: "pictures from before the move", solve: "joint angles", limits: "limits", move: "the head is sent", settle: "it has arrived and rests",
-  look: "new pictures", measure: "the target is found in them", eyes: "the other camera confirms it", repeat: "a later picture repeats it",
+  view: "a view of the panorama", compose: "the mosaic is composed", look: "new pictures", measure: "the target is found in them", eyes: "the other camera confirms it", repeat: "a later picture repeats it",
 };
 
 const SMALL = matchMedia("(max-width: 599px) and (max-height: 499px)");
@@ -18,6 +18,7 @@ const ENDED = ["done", "failed", "stopped"];
 
 const FROM = {
   given: "The range was given.", plane: "The range is that of a plane.", parallax: "The range comes from two poses of one camera.",
+  surface: "The range is that of the surface for which the panorama was composed.",
   unknown: "One camera alone cannot measure the range; after the first pointing its own parallax may.",
 };
 
@@ -28,6 +29,10 @@ const HOW = [
   ["Enter, T", "choose its point; follow it", "keys"],
   ["P", "point at what was chosen", "keys"],
 ];
+
+const at = (what, [x, y]) => `${what}, x ${number(x, 1)}, y ${number(y, 1)} px`;
+/** A refusal without the name of the option that it offers: a button stands beside it. */
+const offered = (message) => message.replace(" (by_direction)", "");
 
 /** An operation's steps, shut once it has ended. */
 export function steps(record) {
@@ -105,19 +110,33 @@ export class Target {
   }
 
   /** A pixel of a shown image was chosen; nothing moves by it. */
-  async choose(eye, pixel, facts) {
+  choose(eye, pixel, facts) {
+    const camera = eye.name, old = facts ? ageWords(facts) : "";
+    const request = facts && { pixel: { camera, frame_id: facts.frame_id, x_px: pixel[0], y_px: pixel[1], mast_digest: facts.mast_digest } };
+    let refused = null;
+    if (facts?.moving) refused = ["The head moved while this image was exposed. Click when it rests.", "frame_moving"];
+    else if (!facts || eye.isStale) refused = [`The image of ${called(camera)} is not of now, so nothing in it can be clicked. ${old}`, "stale"];
+    return this.seek({ label: at(called(camera), pixel), camera, pixel, facts, old, request }, refused);
+  }
+
+  /** A pixel of a panorama was chosen; `more`: to evaluate it by another mast file. */
+  choosePanorama(id, [x, y], more = {}) {
+    return this.seek({ label: at("Panorama", [x, y]), panorama: { id, pixel: [x, y] }, old: "", request: { panorama: { id, x_px: x, y_px: y, ...more } } });
+  }
+
+  /** Preview what was clicked, unless it is refused here. */
+  async seek(click, refused = null) {
     if (!this.may) return this.refuse("You may look. To point, log in with a token of the role operate.", "role");
     const mine = ++this.number;
-    this.click = { camera: eye.name, pixel, facts, old: facts ? ageWords(facts) : "" };
+    this.click = click;
     this.preview = null;
-    if (facts?.moving) return this.refuse("The head moved while this image was exposed. Click when it rests.", "frame_moving");
-    if (!facts || eye.isStale) return this.refuse(`The image of ${called(eye.name)} is not of now, so nothing in it can be clicked. ${this.click.old}`, "stale");
+    if (refused) return this.refuse(...refused);
     this.state = "asked";
-    this.say(`Chosen: ${called(eye.name)}, x ${number(pixel[0], 1)}, y ${number(pixel[1], 1)}. ${this.click.old} Looking for it.`);
+    this.say(`Chosen: ${click.label}. ${click.old} Looking for it.`);
     this.draw();
     this.render();
     try {
-      const preview = await post("/point/preview", { pixel: this.target() });
+      const preview = await post("/point/preview", click.request);
       if (mine !== this.number) return;
       this.preview = preview;
       this.state = "preview";
@@ -130,26 +149,42 @@ export class Target {
     this.render();
   }
 
-  target() {
-    const { camera, pixel, facts } = this.click;
-    return { camera, frame_id: facts.frame_id, x_px: pixel[0], y_px: pixel[1], mast_digest: facts.mast_digest };
+  /** Send what was chosen; `again`: once more, after a pointing at it has ended. */
+  send(again = false) {
+    if (this.state !== (again ? "ended" : "preview") || (!again && this.preview.refused)) return;
+    this.begin(this.click, this.preview, again); // the head has turned since it was chosen: its pixel is another one now
   }
 
-  /** Send what was chosen; `again`: once more, after a pointing at it has ended. */
-  async send(again = false) {
-    if (!this.may || this.latched || this.state !== (again ? "ended" : "preview") || (!again && this.preview.refused)) return;
-    const target = this.target();
-    this.repeats = again; // the head has turned since it was chosen: its pixel is another one now
-    this.state = "sent";
-    this.record = null;
-    this.id = null;
+  /** Send a pointing; without a preview: at a kept target, or in a direction alone. */
+  async begin(click, preview = null, repeats = false) {
+    if (!this.may || this.latched) return;
+    Object.assign(this, { click, preview, repeats, state: "sent", record: null, id: null });
+    this.number += 1;
+    this.draw();
     this.render();
     try {
-      this.id = (await post("/point", { pixel: target })).id;
+      this.id = (await post("/point", click.request)).id;
       this.operation(this.events.newest("operation", this.id));
     } catch (error) {
       this.refuse(error.code === "frame_too_old" ? "The image in which the point was chosen is no longer kept. Choose the point again." : error.message, error.code);
     }
+  }
+
+  /** What a panorama's refusal leaves: the direction alone, or its angles by the mast file in use. */
+  instead(message, code) {
+    const { request: { panorama } = {}, panorama: clicked } = this.click ?? {};
+    if (!panorama || !this.may || panorama.by_direction) return null;
+    const offer = (words, act) => h("div", { class: "buttons" }, h("button", { type: "button", id: "instead", disabled: this.latched, onclick: act }, words));
+    if (code === "other_mast_file") return offer("Use its angles by this mast file", () => this.choosePanorama(clicked.id, clicked.pixel, { recompute: true }));
+    if (!message.includes("by_direction") && !/^(target_|eyes_disagree|not_in_view)/.test(code)) return null;
+    return offer("Point by direction alone", () => this.begin({ ...this.click, label: `${this.click.label}, direction alone`, request: { panorama: { ...panorama, by_direction: true } } }));
+  }
+
+  /** The position that is shown, rover frame of now, and its covariance where one is known; null without. */
+  position() {
+    if (this.state === "preview") return this.preview;
+    if (this.state !== "ended" || !this.record.position_m) return null;
+    return { covariance_m2: null, ...this.record.steps.findLast((step) => step.name === "triangulate")?.detail, position_m: this.record.position_m };
   }
 
   operation(record) {
@@ -159,7 +194,7 @@ export class Target {
     if (ENDED.includes(record.state) && this.state === "sent") {
       this.state = "ended";
       this.truly = null;
-      if (this.simulated && record.residual_px) this.judge(record);
+      if (this.simulated && record.residual_px && this.click.facts) this.judge(record);
       if (record.residual_px) this.say(`Residual x ${number(record.residual_px[0], 2, true)}, y ${number(record.residual_px[1], 2, true)} pixels.`);
       else if (record.error) this.say(inDegrees(record.error.message), true);
       this.draw();
@@ -193,7 +228,7 @@ export class Target {
       let click = null, match = null, aim = null, found = null;
       const chosen = this.state === "sent" ? !this.repeats && !this.moving() : ["asked", "preview"].includes(this.state);
       if (chosen && this.click.camera === name) click = this.click.pixel;
-      if (chosen && this.preview?.other_camera === name) match = this.preview.other_pixel_px;
+      if (chosen && this.click.camera && this.preview?.other_camera === name) match = this.preview.other_pixel_px;
       const last = this.state === "ended" ? this.record?.pointings.at(-1) : null;
       if (last?.camera === name) [aim, found] = [last.aim_px, last.target_px];
       eye.mark("click", click, "click", null);
@@ -211,20 +246,21 @@ export class Target {
       none: () => [h("dl", { class: "how" }, HOW.map(([what, words, kind]) => h("div", { class: kind }, h("dt", {}, what), h("dd", {}, words))))],
       asked: () => [this.chosen(), h("p", { class: "busy" }, "Looking for it in fresh images …")],
       preview: () => [this.chosen(), this.seen(), this.way(), this.go()],
-      refused: () => [h("p", { class: "bad" }, this.words), this.code === "no_stereo" ? h("p", { class: "quiet" }, "Without a second camera a pixel has no range; turn the head by angles or by hand.") : null],
-      sent: () => [this.seen(), this.progress()],
+      refused: () => [h("p", { class: "bad" }, offered(this.words)), this.instead(this.words, this.code), this.code === "no_stereo" ? h("p", { class: "quiet" }, "Without a second camera a pixel has no range; turn the head by angles or by hand.") : null],
+      sent: () => [this.preview ? this.seen() : this.chosen(), this.progress()],
       ended: () => [this.result(), this.progress()],
     };
     put(this.place, parts[this.state]());
     // Where a window holds little more than the image, what came of it is brought into sight.
     if (this.place.dataset.state !== this.state && ["preview", "refused", "ended"].includes(this.state) && SMALL.matches) this.place.parentElement.scrollIntoView();
     this.place.dataset.state = this.state;
+    document.dispatchEvent(new CustomEvent("target-changed"));
     if (this.state === "ended" && this.record?.pointings.at(-1)?.aim_px && this.record.residual_px && this.drawn !== this.record.id) this.picture();
   }
 
   chosen() {
-    const { camera, pixel, old } = this.click;
-    return [h("p", {}, `${called(camera)}  x ${number(pixel[0], 1)}  y ${number(pixel[1], 1)} px`), old ? h("p", { class: "warn", id: "old" }, old) : null];
+    const { label, old } = this.click;
+    return [h("p", {}, label), old ? h("p", { class: "warn", id: "old" }, old) : null];
   }
 
   seen() {
@@ -272,7 +308,7 @@ export class Target {
 
   result() {
     const record = this.record;
-    if (record.state !== "done") return h("p", { class: "bad" }, record.error ? inDegrees(record.error.message) : `The operation was ${record.state}.`);
+    if (record.state !== "done") return record.error ? [h("p", { class: "bad" }, offered(inDegrees(record.error.message))), this.instead(record.error.message, record.error.code)] : h("p", { class: "bad" }, `The operation was ${record.state}.`);
     const last = record.pointings.at(-1);
     if (!last.residual_px) return h("p", { class: "quiet" }, last.note);
     const [x, y] = last.residual_px;
