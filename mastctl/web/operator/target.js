@@ -251,10 +251,10 @@ export class Target {
       ended: () => [this.result(), this.progress()],
     };
     put(this.place, parts[this.state]());
+    document.dispatchEvent(new CustomEvent("target-changed"));
     // Where a window holds little more than the image, what came of it is brought into sight.
     if (this.place.dataset.state !== this.state && ["preview", "refused", "ended"].includes(this.state) && SMALL.matches) this.place.parentElement.scrollIntoView();
     this.place.dataset.state = this.state;
-    document.dispatchEvent(new CustomEvent("target-changed"));
     if (this.state === "ended" && this.record?.pointings.at(-1)?.aim_px && this.record.residual_px && this.drawn !== this.record.id) this.picture();
   }
 
