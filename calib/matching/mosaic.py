@@ -41,8 +41,8 @@ MATCH = MatchSettings(roughness=0.0)
 RELIEF_PER_M = 0.5
 """One sigma of what the scene's inverse range may differ from the surface by, for the test of slips."""
 STEP_RAD = 1e-4
-LEAST_SLIP_RAD = 1e-4
-"""Smaller ones are what mast files leave."""
+LEAST_SLIP_RAD = 5e-4
+"""Smaller ones are what good mast files leave: up to 0.3 mrad of the packaged one."""
 SLIP_CHI2 = 30.0
 """A slip explains this much, or none is named: with 100 views one of 30,000 panoramas has it by chance."""
 GROSS_SIGMA = 5.0
