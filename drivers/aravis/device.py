@@ -19,8 +19,8 @@ from drivers.aravis import find
 from drivers.aravis.camera_clock import WallClock
 from drivers.aravis.library import CONTROL_LOST, GenicamError, library
 from drivers.aravis.settings import (
-    CHUNKS,
     EXPOSURE,
+    MEANINGS,
     AravisOptions,
     Control,
     Feature,
@@ -249,7 +249,7 @@ class Device:
             log.info("%s: no settings with each frame: %s", self._name, error)
         if self._parser is None:
             return
-        for one in CHUNKS:
+        for one in MEANINGS:
             try:
                 if one is EXPOSURE or arv("camera_is_feature_available", camera, one.feature):
                     arv("camera_set_chunk_state", camera, one.feature, 1)
@@ -312,7 +312,7 @@ class Device:
         with self._feature_lock:
             self._check_open()
             try:
-                return settings_of(self._arv, self._camera, self._options, self.period_s)
+                return settings_of(self._arv, self._camera, self.period_s)
             except GenicamError as error:
                 raise StreamFailed(f"its settings cannot be read: {error}", device=self._name) from None
 

@@ -1,7 +1,6 @@
-"""The settings that go by meaning: exposure, gain, white balance and focus, at the opening and at run time.
+"""The options of a camera, and its settings: exposure and gain, at the opening and at run time.
 
-Exposure and gain have several names in GenICam, all of which Aravis knows. For a white balance in kelvin and
-a focus there is no standard name; those here are The Imaging Source's.
+Both have several names in GenICam, all of which Aravis knows.
 """
 
 from __future__ import annotations
@@ -130,7 +129,7 @@ class Feature:
     feature, automatic
         The GenICam names of its value, also as chunk data, and of its automatic.
     called
-        How Aravis calls it in its functions; empty: it has none for it.
+        How Aravis calls it in its functions.
     unit
         Of the camera's own number, in that of `SETTINGS`.
     """
@@ -139,22 +138,14 @@ class Feature:
     word: str
     feature: str
     automatic: str
-    called: str = ""
+    called: str
     unit: float = 1.0
 
 
-# Names: GenICam's Standard Features Naming Convention (SFNC); white balance and focus as The Imaging Source's
-# cameras have them (tiscamera), which the SFNC does not name.
+# Names: GenICam's Standard Features Naming Convention (SFNC).
 EXPOSURE = Feature("exposure_s", "exposure time", "ExposureTime", "ExposureAuto", "exposure_time", 1e-6)
 GAIN = Feature("gain", "gain", "Gain", "GainAuto", "gain")
-MEANINGS = (
-    EXPOSURE,
-    GAIN,
-    Feature("white_balance_k", "white balance", "BalanceWhiteTemperature", "BalanceWhiteAuto"),
-    Feature("focus", "focus", "Focus", "FocusAuto"),
-)
-CHUNKS = (EXPOSURE, GAIN)
-"""Those that GenICam has as chunk data."""
+MEANINGS = (EXPOSURE, GAIN)
 
 
 class Control:
@@ -162,17 +153,7 @@ class Control:
 
     def __init__(self, arv: Library, camera: int, meaning: Feature) -> None:
         self._arv, self._camera, self.meaning = arv, camera, meaning
-        arguments = (meaning.feature,) * (not meaning.called)
-        name = f"is_{meaning.called or 'feature'}_available"
-        self.exists = bool(arv(f"camera_{name}", camera, *arguments))
-
-    def _kind(self) -> str:
-        """How GenICam keeps the feature."""
-        try:
-            self._arv("camera_get_float", self._camera, self.meaning.feature)
-        except GenicamError:
-            return "integer"
-        return "float"
+        self.exists = bool(arv(f"camera_is_{meaning.called}_available", camera))
 
     @property
     def automatic(self) -> bool:
@@ -187,19 +168,14 @@ class Control:
         if self.automatic:
             return None
         one = self.meaning
-        if one.called:
-            return one.unit * float(self._arv(f"camera_get_{one.called}", self._camera))
-        return one.unit * float(self._arv(f"camera_get_{self._kind()}", self._camera, one.feature))
+        return one.unit * float(self._arv(f"camera_get_{one.called}", self._camera))
 
     def bounds(self) -> tuple[float, float]:
         """Return the least and the highest that may be set."""
         one = self.meaning
-        kind = "" if one.called else self._kind()
-        number = ctypes.c_int64 if kind == "integer" else ctypes.c_double
-        low, high = number(), number()
-        arguments = (one.feature,) if kind else ()
-        name = f"camera_get_{kind or one.called}_bounds"
-        self._arv(name, self._camera, *arguments, ctypes.byref(low), ctypes.byref(high))
+        low, high = ctypes.c_double(), ctypes.c_double()
+        name = f"camera_get_{one.called}_bounds"
+        self._arv(name, self._camera, ctypes.byref(low), ctypes.byref(high))
         return one.unit * low.value, one.unit * high.value
 
     def set(self, value: float) -> None:
@@ -209,7 +185,7 @@ class Control:
         if was != OFF:
             self._arv("camera_set_string", self._camera, name, OFF)
         try:
-            self._set(value)
+            self._arv(f"camera_set_{self.meaning.called}", self._camera, value / self.meaning.unit)
         except GenicamError as error:
             if was != OFF:
                 try:
@@ -217,15 +193,6 @@ class Control:
                 except GenicamError as other:
                     raise GenicamError(f"{error}; {name} stays {OFF}: {other}") from None
             raise
-
-    def _set(self, value: float) -> None:
-        one, counts = self.meaning, value / self.meaning.unit
-        if one.called:
-            self._arv(f"camera_set_{one.called}", self._camera, counts)
-        elif self._kind() == "float":
-            self._arv("camera_set_float", self._camera, one.feature, counts)
-        else:
-            self._arv("camera_set_integer", self._camera, one.feature, round(counts))
 
 
 def set_up(
@@ -267,9 +234,7 @@ def _other(one: Feature, value: float | None, wanted: float) -> list[str]:
     return [f"{one.name} is {value:.6g} where {wanted:.6g} was requested{NEAREST}"]
 
 
-def settings_of(
-    arv: Library, camera: int, options: AravisOptions, period_s: float | None
-) -> list[CameraSetting]:
+def settings_of(arv: Library, camera: int, period_s: float | None) -> list[CameraSetting]:
     """Return what of a camera may be changed, as it is now.
 
     ``period_s`` is from frame to frame and bounds an exposure; None if the camera is triggered or does not
@@ -283,15 +248,7 @@ def settings_of(
         low, high = control.bounds()
         if one is EXPOSURE and period_s is not None:
             high = max(low, min(high, period_s))
-        refusal = ""
-        if one.name == "focus" and one.feature not in options.features:
-            refusal = (
-                f"is not in the camera's options (features: {one.feature}), "
-                "so no restart could come back to the calibrated one"
-            )
-        found.append(
-            CameraSetting(one.name, control.value(), low, high, automatic=control.automatic, refusal=refusal)
-        )
+        found.append(CameraSetting(one.name, control.value(), low, high, automatic=control.automatic))
     return found
 
 

@@ -1,1 +1,1 @@
-"""Heads of two Feetech STS, SMS or SCS servos; feetech-servo-sdk judges the packets."""
+"""Heads of two Feetech STS or SMS servos; feetech-servo-sdk judges the packets."""

@@ -10,6 +10,7 @@ for them alone. Everything written is read back. The offset in the EEPROM is rep
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -19,7 +20,7 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, WithJsonSchema, model_validator
 
-from calib.files.records import ABSENT, problem
+from calib.files.records import ABSENT
 from drivers.clock import Clock
 from drivers.errors import DriverError, HardwareFault, NoReply, WrongDevice
 from drivers.feetech.servos import (
@@ -32,7 +33,6 @@ from drivers.feetech.servos import (
     UNLOCKED,
     FeetechLink,
     FeetechModel,
-    Questions,
     facts,
     model_named,
     present,
@@ -64,16 +64,14 @@ class FeetechAxisSettings(ServoAxisSettings):
     """One axis."""
 
     model: Annotated[FeetechModel, named_model(model_named, MODELS)]
-    """Which servo; one that is not in the table by its series: STS, SMS or SCS."""
+    """Which servo; one that is not in the table by its series: STS or SMS."""
     torque_percent: Annotated[float, Field(ge=2.0, le=100.0)] | None = None
     """Bound of the motor's drive; left out: as much as the servo's EEPROM allows."""
     speed_unit_counts: Literal[1, 50] = 1
     """Counts per second of one unit of its speed; 50 in some firmware."""
 
     @model_validator(mode="after")
-    def _check_series(self) -> Self:
-        if self.torque_percent is not None and self.model.is_scs:
-            raise problem("torque_percent", f"a {self.model.name} has no torque limit")
+    def _set_speed_unit(self) -> Self:
         object.__setattr__(self, "model", self.model.with_speed_unit(self.speed_unit_counts))
         return self
 
@@ -104,8 +102,6 @@ class FeetechSettings(HeadSettings):
 
     @model_validator(mode="after")
     def _check_lease(self) -> Self:
-        if self.pan.model.is_scs != self.tilt.model.is_scs:
-            raise problem("pan.model", "it is of another series than tilt.model; one on a bus is expected")
         self._set_patience("lease_s", USUAL_LEASE_S, SHORTEST_LEASE_S)
         return self
 
@@ -125,7 +121,7 @@ LEAST_TORQUE = 20  # space below a torque limit for the tokens of the questions
 class FeetechMemory:
     """What outlasts a line of the head: questions, and the offset in each EEPROM as found first, by id."""
 
-    questions: Questions = field(default_factory=Questions)
+    questions: Iterator[int] = field(default_factory=itertools.count)
     offsets: dict[int, int] = field(default_factory=dict)
 
 
@@ -170,18 +166,15 @@ class FeetechServo(BusServo):
         model = self._settings.model
         number = self.get("model_number")
         if model.number is not None and number != model.number:
-            swapped = number >> 8 | (number & 0xFF) << 8
-            other = MODELS_BY_NUMBER.get(number) or MODELS_BY_NUMBER.get(swapped)
+            other = MODELS_BY_NUMBER.get(number)
             found = f"a {other.name}" if other else f"of the model number {number}, which is not in the table"
             raise WrongDevice(
                 f"{self.name} is {found}, the configuration says {model.name}; a servo that is not in the "
-                "table is named by its series: STS, SMS or SCS"
+                "table is named by its series: STS or SMS"
             )
         if self.get("response_level") != 1:
             with self._unlocked(answers=False):
                 self._link.write_unanswered(self.servo_id, self._registers["response_level"], 1)
-        if "offset" not in self._registers:
-            return
         offset = self.get("offset")
         known = self._offsets.setdefault(self.servo_id, offset)
         if offset != known:
@@ -198,8 +191,7 @@ class FeetechServo(BusServo):
         """Return what the servo says about its motion, requested one time; as `FeetechLink.samples`."""
         if not self.torque_limit:  # each question writes it: it must never rise above the servo's own
             self._bound_torque()
-        requested = {self.servo_id: (self._settings.model, self.torque_limit)}
-        sample = self._link.samples(requested)[self.servo_id]
+        sample = self._link.samples({self.servo_id: self.torque_limit})[self.servo_id]
         self.truth.check(sample)
         return sample
 
@@ -224,9 +216,6 @@ class FeetechServo(BusServo):
 
     def _bound_torque(self) -> int:
         """Take the torque limit from the servo's EEPROM and the options; returns that bound, 0.1 %."""
-        if "torque_limit" not in self._registers:  # SCS: its questions write nothing
-            self.torque_limit = 1000
-            return self.torque_limit
         most = self.get("max_torque")
         bound = min(self._settings.torque_limit or most, most)
         self.torque_limit = max(bound, LEAST_TORQUE)
@@ -234,15 +223,16 @@ class FeetechServo(BusServo):
 
     def set_up(self) -> None:
         """As `BusServo`; also that the torque limit has room for the questions' tokens."""
-        if "torque_limit" in self._registers and (bound := self._bound_torque()) < LEAST_TORQUE:
+        if (bound := self._bound_torque()) < LEAST_TORQUE:
             raise WrongDevice(
                 f"{self.name} has the torque limit {bound / 10:g} % in its EEPROM; expected "
                 f"{LEAST_TORQUE / 10:g} % or more (max_torque)"
             )
         low, high = self._settings.limit_counts
-        wanted = {"return_delay": 0, "min_angle_limit": low, "max_angle_limit": high}
-        if "operating_mode" in self._registers:
-            wanted["operating_mode"] = POSITION_MODE
+        wanted = {
+            "return_delay": 0, "min_angle_limit": low, "max_angle_limit": high,
+            "operating_mode": POSITION_MODE,
+        }  # fmt: skip
         self._change({name: value for name, value in wanted.items() if self.get(name) != value})
 
     def _set_permanent(self, values: Mapping[str, int]) -> None:
@@ -265,16 +255,16 @@ class FeetechServo(BusServo):
 
     @property
     def profile(self) -> tuple[int, int]:
-        """Acceleration and speed of the configuration, in its counts; an SCS has no acceleration."""
+        """Acceleration and speed of the configuration, in its counts."""
         acceleration, speed = super().profile
-        return (1 if self._settings.model.is_scs else min(254, acceleration)), speed
+        return min(254, acceleration), speed
 
     def leg(self, profile: tuple[int, int], goal: int) -> Part:
         """Return a goal with its profile, as `BusServo.leg`; a goal time of 0 means by speed."""
-        values = {"goal_position": goal, "goal_time": 0, "goal_speed": profile[1]}
-        if not self._settings.model.is_scs:
-            values = {"acceleration": profile[0], **values}
-        return self.neighbours(values)
+        acceleration, speed = profile
+        return self.neighbours(
+            {"acceleration": acceleration, "goal_position": goal, "goal_time": 0, "goal_speed": speed}
+        )
 
     def send_leg(self, profile: tuple[int, int], goal: int) -> None:
         """Set a goal with its profile; the next sample shows it. Raises LineLost, BadReply."""
@@ -282,8 +272,7 @@ class FeetechServo(BusServo):
 
     def _aim_at_place(self) -> bool:
         counts = self.check_place()
-        if "acceleration" in self._registers:
-            self.set("acceleration", self.profile[0])
+        self.set("acceleration", self.profile[0])
         self.set("goal_time", 0)
         self.set("goal_speed", self.profile[1])
         self.set("goal_position", counts)
@@ -294,8 +283,7 @@ class FeetechServo(BusServo):
         try:
             if limp:
                 self.set("torque_enable", 0)
-            if "torque_limit" in self._registers:
-                self.set("torque_limit", self.torque_limit)
+            self.set("torque_limit", self.torque_limit)
         except DriverError as error:
             log.warning("%s is not left as it should be at the end: %s", self.name, error)
 
@@ -353,10 +341,7 @@ class FeetechPair(ServoPair):
     def samples(self) -> list[ServoSample]:
         """Return what both servos say about their motion now; raises as `FeetechLink.samples`."""
         servos = [axis.servo for axis in self.axes]
-        requested = {
-            axis.servo.servo_id: (axis.settings.model, axis.servo.torque_limit) for axis in self.axes
-        }
-        found = self.link.samples(requested)
+        found = self.link.samples({servo.servo_id: servo.torque_limit for servo in servos})
         for servo in servos:
             servo.truth.check(found[servo.servo_id])
         return [found[servo.servo_id] for servo in servos]

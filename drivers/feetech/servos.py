@@ -1,8 +1,8 @@
 """Feetech's servos: their memory, packets, transactions on a line, and what is done with them on the bench.
 
-Sources: the maker's memory tables of STS/SMS and SCSCL servos, its protocol manual and the addresses in its
-SDK. The maker states no backlash. A count of speed is one count a second in the maker's SDK of 2020, and 50
-in that of 2025: it depends on the firmware and has to be configured (``speed_unit_counts``).
+Sources: the maker's memory tables of STS/SMS servos, its protocol manual and the addresses in its SDK. The
+maker states no backlash. A count of speed is one count a second in the maker's SDK of 2020, and 50 in that of
+2025: it depends on the firmware and has to be configured (``speed_unit_counts``).
 
 A packet is ``FF FF``, id, length, instruction or status, data, and an inverted sum. The sum has eight bits:
 one wrong byte is always seen, several pass once in 256. Nothing is stuffed. A reply has no sequence number
@@ -10,13 +10,12 @@ and does not say what was requested. What proves a sample is:
 
 - **Length.** Each question reads another number of bytes, `STARTS` of them in turn; another length is no
   answer.
-- **Token** (STS, SMS). Just before it, each question writes a number into the torque limit of both servos, up
+- **Token.** Just before it, each question writes a number into the torque limit of both servos, up
   to `TOKENS` steps of 0.1 % below what is configured, and reads it back within the answer. Together that is
   the number of a question out of `STARTS * TOKENS`: a reply is distinguished from any up to 271 questions
   late.
-- **Agreement** (SCS, which has no such register). For `LATE_S` after a reply that was lost, wrong or one too
-  many, each question is sent twice, by two lengths, and the answers have to fit. This proves less: a reply
-  that is later than that, or two that are late alike, are taken.
+
+An SCS has no such register, and 0.3 degrees a count: it is not driven.
 
 What is read for one register is read twice around a silence, by two lengths, and has to agree.
 """
@@ -25,12 +24,11 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Literal
 
 from drivers.errors import BadOptions, BadReply, DriverError, LineLost, NoReply, WrongDevice
 from drivers.faults import nearest
@@ -41,7 +39,7 @@ from drivers.servo_bus.port import QUIET_S, PacketFormat, Part, Register, Status
 from drivers.servo_bus.settings import CountedModel
 
 BAUD_RATES = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
-"""By their code: the maker's SMS_STS.h (2021, 2025), SCSCL.h (2018, 2020) and memory tables, address 6.
+"""By their code: the maker's SMS_STS.h (2021, 2025) and memory tables, address 6.
 
 lerobot's table (57,600, 38,400, 19,200 for the codes 5 to 7) contradicts the maker's.
 """
@@ -57,6 +55,7 @@ STATUS_FAULTS = MappingProxyType(
     }
 )
 POSITION_MODE = 0
+COUNT_RAD = math.tau / 4096
 UNLOCKED, LOCKED = 0, 1
 
 
@@ -68,11 +67,10 @@ class Item(Register):
     """
 
     sign_bit: int | None = None
-    order: Literal["little", "big"] = "little"
 
     def decode(self, data: bytes) -> int:
         """Return its value, as `Register`."""
-        word = int.from_bytes(data, self.order)
+        word = int.from_bytes(data, "little")
         if self.sign_bit is None:
             return word
         size = word & ((1 << self.sign_bit) - 1)
@@ -82,40 +80,33 @@ class Item(Register):
         """Return its bytes, as `Register`."""
         if value < 0 and self.sign_bit is not None:
             value = -value | 1 << self.sign_bit
-        return value.to_bytes(self.size, self.order)
+        return value.to_bytes(self.size, "little")
 
 
-def _table(order: Literal["little", "big"], *more: Item) -> Mapping[str, Item]:
-    """The registers that all series have where SCS and STS have them, and more."""
-    common = (
-        Item("firmware_major", 0), Item("firmware_minor", 1), Item("model_number", 3, 2),
-        Item("id", 5), Item("baud", 6), Item("return_delay", 7), Item("response_level", 8),
-        Item("min_angle_limit", 9, 2), Item("max_angle_limit", 11, 2),
-        Item("temperature_limit", 13), Item("max_voltage_limit", 14),
-        Item("min_voltage_limit", 15), Item("max_torque", 16, 2),
-        Item("unload_condition", 19), Item("torque_enable", 40),
-        Item("goal_position", 42, 2), Item("goal_time", 44, 2), Item("goal_speed", 46, 2),
-        Item("present_position", 56, 2, 15), Item("present_velocity", 58, 2, 15),
-        Item("present_load", 60, 2, 10), Item("present_voltage", 62),
-        Item("present_temperature", 63), Item("status", 65), Item("moving", 66),
-    )  # fmt: skip
-    every = sorted((*common, *more), key=lambda register: register.address)
-    return MappingProxyType({register.name: replace(register, order=order) for register in every})
-
-
-STS = _table(
-    "little",
-    Item("protective_current", 28, 2), Item("offset", 31, 2, 11), Item("operating_mode", 33),
-    Item("protective_torque", 34), Item("protective_time", 35), Item("overload_torque", 36),
-    Item("acceleration", 41), Item("torque_limit", 48, 2), Item("lock", 55),
-    Item("present_current", 69, 2, 15),
+REGISTERS: Mapping[str, Item] = MappingProxyType(
+    {
+        item.name: item
+        for item in (
+            Item("firmware_major", 0), Item("firmware_minor", 1), Item("model_number", 3, 2),
+            Item("id", 5), Item("baud", 6), Item("return_delay", 7), Item("response_level", 8),
+            Item("min_angle_limit", 9, 2), Item("max_angle_limit", 11, 2),
+            Item("temperature_limit", 13), Item("max_voltage_limit", 14), Item("min_voltage_limit", 15),
+            Item("max_torque", 16, 2), Item("unload_condition", 19), Item("protective_current", 28, 2),
+            Item("offset", 31, 2, 11), Item("operating_mode", 33), Item("protective_torque", 34),
+            Item("protective_time", 35), Item("overload_torque", 36),
+            Item("torque_enable", 40), Item("acceleration", 41), Item("goal_position", 42, 2),
+            Item("goal_time", 44, 2), Item("goal_speed", 46, 2), Item("torque_limit", 48, 2),
+            Item("lock", 55), Item("present_position", 56, 2, 15), Item("present_velocity", 58, 2, 15),
+            Item("present_load", 60, 2, 10), Item("present_voltage", 62), Item("present_temperature", 63),
+            Item("status", 65), Item("moving", 66), Item("present_current", 69, 2, 15),
+        )
+    }
 )  # fmt: skip
-SCS = _table("big", Item("protective_torque", 37), Item("protective_time", 38), Item("lock", 48))
 
 
 @dataclass(frozen=True, kw_only=True)
 class FeetechModel(CountedModel):
-    """One kind of servo, as of `CountedModel`; the acceleration of an SCS, which has none, is assumed.
+    """One kind of servo, as of `CountedModel`.
 
     ``speed_unit_counts``: counts a second of one unit of its speed, 1, or 50 in some firmware.
     """
@@ -123,30 +114,23 @@ class FeetechModel(CountedModel):
     registers: Mapping[str, Item]
     speed_unit_counts: int = 1
 
-    @property
-    def is_scs(self) -> bool:
-        """Whether it is of the SCS series: no torque limit, no acceleration, no read of several servos."""
-        return self.registers is SCS
-
     def with_speed_unit(self, counts: int) -> FeetechModel:
         """Return it with another unit of speed."""
         return replace(self, speed_unit_counts=counts, velocity_unit_rad_per_s=counts * self.count_rad)
 
 
 def _model(name: str, number: int | None) -> FeetechModel:
-    scs = name.startswith("SCS")
-    counts, turn_rad = (1024, math.radians(300)) if scs else (4096, math.tau)
     return FeetechModel(
         name=name,
         number=number,
-        registers=SCS if scs else STS,
+        registers=REGISTERS,
         low_count=0,
-        high_count=counts - 1,
-        centre_count=counts // 2,
-        count_rad=turn_rad / counts,
-        velocity_unit_rad_per_s=turn_rad / counts,
-        acceleration_unit_rad_per_s2=100 * turn_rad / counts,
-        current_unit_A=None if scs else 0.0065,
+        high_count=4095,
+        centre_count=2048,
+        count_rad=COUNT_RAD,
+        velocity_unit_rad_per_s=COUNT_RAD,
+        acceleration_unit_rad_per_s2=100 * COUNT_RAD,
+        current_unit_A=0.0065,
     )
 
 
@@ -156,11 +140,11 @@ MODELS: Mapping[str, FeetechModel] = MappingProxyType(
         model.name: model
         for model in (
             _model("STS3215", 777), _model("STS3250", 2825), _model("SM8512BL", 11272),
-            _model("SCS0009", 1284), _model("STS", None), _model("SMS", None), _model("SCS", None),
+            _model("STS", None), _model("SMS", None),
         )
     }
 )  # fmt: skip
-"""By name; a series, such as ``STS``, takes any servo of it: 4096 counts a turn, or 1024 over 300 degrees."""
+"""By name; a series, such as ``STS``, takes any servo of it: 4096 counts a turn."""
 
 MODELS_BY_NUMBER = {model.number: model for model in MODELS.values() if model.number is not None}
 
@@ -171,7 +155,7 @@ def model_named(name: str) -> FeetechModel:
     if found is None:
         raise BadOptions(
             f"there is no Feetech servo {name!r}{nearest(str(name).upper(), MODELS)}; one that is not in the "
-            "table is named by its series: STS, SMS or SCS"
+            "table is named by its series: STS or SMS"
         )
     return found
 
@@ -243,19 +227,9 @@ FORMAT = PacketFormat(
 
 
 STARTS, TOKENS = 17, 16
-FIRST_START = 24  # of what is read, up to torque_enable
-LATE_S = 1.0
-SAME_COUNTS = 2  # apart at most, of two answers of an axis that stands
+FIRST_START, END = 24, 71  # of what is read, up to torque_enable
 AGREEING_TRIES = 5
 POLL_BYTES = 24 + 2 * (6 + 47)  # a write and a read of both servos, and two replies of the longest question
-
-
-@dataclass
-class Questions:
-    """Which question comes next, and until when late replies may come; outlasts a line of the head."""
-
-    numbers: itertools.count[int] = field(default_factory=itertools.count)
-    doubted_until_s: float = -math.inf
 
 
 class FeetechLink(BusLink):
@@ -265,9 +239,9 @@ class FeetechLink(BusLink):
     finds_echo = True
 
     @cached_property
-    def questions(self) -> Questions:
-        """Of this line, unless it is given the head's."""
-        return Questions()
+    def questions(self) -> Iterator[int]:
+        """The numbers of this line's questions, unless it is given the head's."""
+        return itertools.count()
 
     def ping(self, servo_id: int) -> int:
         """Return the status of a servo that is there. Raises NoReply, BadReply, LineLost."""
@@ -318,21 +292,18 @@ class FeetechLink(BusLink):
         self.port.suspect = True
         super().write_at_once(parts, copies)
 
-    def samples(self, servos: Mapping[int, tuple[FeetechModel, int]]) -> dict[int, ServoSample]:
+    def samples(self, servos: Mapping[int, int]) -> dict[int, ServoSample]:
         """Return what servos say about their motion now, by id.
 
         Raises NoReply, BadReply, LineLost if one is silent, or an answer is not of this question.
 
-        ``servos`` has of each id its model, all of one series, and its full torque limit, 0.1 %.
+        ``servos`` has of each id its full torque limit, 0.1 %.
         """
-        number = next(self.questions.numbers)
+        number = next(self.questions)
         start, token = FIRST_START + number % STARTS, number % TOKENS
-        if any(model.is_scs for model, _ in servos.values()):
-            return self._one_by_one(servos, start)
-        end = 71
-        limits = {one: limit - token for one, (_, limit) in servos.items()}
+        limits = {one: limit - token for one, limit in servos.items()}
         tokens = [Part(one, 48, 2, limit.to_bytes(2, "little")) for one, limit in limits.items()]
-        length, ids = end - start, tuple(servos)
+        length, ids = END - start, tuple(servos)
         question = group_write_packet(tokens) + sync_read_packet(start, length, ids)
         try:
             sent_s = self.port.send(question, len(ids) * (STATUS_BYTES + length))
@@ -342,7 +313,7 @@ class FeetechLink(BusLink):
         received_s = self.clock.now_s()
         found = {}
         for one, status in taken.items():
-            values = _values(servos[one][0], start, status.data)
+            values = _values(start, status.data)
             if values["torque_limit"] != limits[one]:
                 self.note_unexpected(status)
                 raise BadReply(
@@ -351,7 +322,7 @@ class FeetechLink(BusLink):
                     "question",
                     detail=self.where(one, "sync read", "torque_limit"),
                 )
-            values["torque_limit"] = servos[one][1]
+            values["torque_limit"] = servos[one]
             found[one] = ServoSample(values, status.alert, sent_s, received_s)
         return found
 
@@ -378,60 +349,17 @@ class FeetechLink(BusLink):
                     )
         return taken
 
-    def _one_by_one(
-        self, servos: Mapping[int, tuple[FeetechModel, int]], start: int
-    ) -> dict[int, ServoSample]:
-        """The same of servos that answer one at a time: twice where a late reply may be under way."""
-        try:
-            found = self._round(servos, start)
-            if self.clock.now_s() < self.questions.doubted_until_s:
-                before, next_start = found, FIRST_START + next(self.questions.numbers) % STARTS
-                found = self._round(servos, next_start)
-                for one, sample in found.items():
-                    self._check_same(one, servos[one][0].speed_unit_counts, before[one], sample)
-        except LineLost:
-            raise
-        except DriverError:
-            self.questions.doubted_until_s = self.clock.now_s() + LATE_S
-            raise
-        return found
 
-    def _round(self, servos: Mapping[int, tuple[FeetechModel, int]], start: int) -> dict[int, ServoSample]:
-        """One answer of each servo. Raises NoReply, BadReply, LineLost."""
-        found = {}
-        for one, (model, _) in servos.items():
-            sent_s = self.clock.now_s()
-            status = self.request(one, READ, bytes((start, 67 - start)), 67 - start, "motion")
-            values = _values(model, start, status.data)
-            found[one] = ServoSample(values, status.alert, sent_s, self.clock.now_s())
-            if self.port.suspect:
-                raise BadReply(f"{self.name}: more came than was requested")
-        return found
-
-    def _check_same(self, one: int, unit: int, before: ServoSample, after: ServoSample) -> None:
-        """Pass two samples that can follow one another. Raises BadReply."""
-        reported = max(abs(sample.values["present_velocity"]) for sample in (before, after))
-        speed = unit * (reported + (unit > 1))  # less than one unit more is not reported
-        most = SAME_COUNTS + speed * (after.received_s - before.sent_s)
-        if abs(after.counts - before.counts) > most:
-            raise BadReply(
-                f"servo {one} on {self.name} says {before.counts} and then {after.counts} counts, where a "
-                "reply was lost before: one of them is late",
-                detail=self.where(one, "read", "present_position"),
-            )
-
-
-def _values(model: FeetechModel, start: int, data: bytes) -> dict[str, int]:
+def _values(start: int, data: bytes) -> dict[str, int]:
     """The registers in a block by name, and what `AxisCourse` reads beside them."""
     values = {}
-    for register in model.registers.values():
+    for register in REGISTERS.values():
         at = register.address - start
         if register.address >= 40 and at + register.size <= len(data):
             values[register.name] = register.decode(data[at : at + register.size])
     values["moving_status"] = 2 * values["moving"]  # a profile is under way
-    values["profile_acceleration"] = values.get("acceleration", 1)
+    values["profile_acceleration"] = values["acceleration"]
     values["profile_velocity"] = values["goal_speed"]
-    values.setdefault("present_current", 0)
     return values
 
 
@@ -440,8 +368,12 @@ def present(link: FeetechLink) -> tuple[list[FoundServo], int]:
     ids, noise = link.ping_all()
     found = []
     for servo_id in ids:
-        with suppress(NoReply):
+        try:
             found.append(_found(link, servo_id))
+        except WrongDevice:
+            found.append(FoundServo(link.baud, servo_id, 0, "SCS", "", ()))
+        except NoReply:
+            continue
     return found, noise
 
 
@@ -454,8 +386,7 @@ def _found(link: FeetechLink, servo_id: int) -> FoundServo:
 def identify(link: FeetechLink, servo_id: int) -> tuple[FeetechModel, int, str]:
     """Return a servo's model, the number in its memory, and its firmware.
 
-    One that is not in the table is taken by the byte order that its memory states. Raises NoReply, BadReply,
-    LineLost.
+    Raises WrongDevice for an SCS, whose memory states the other byte order; NoReply, BadReply, LineLost.
     """
     before = b""
     for _ in range(ATTEMPTS + 1):
@@ -463,22 +394,17 @@ def identify(link: FeetechLink, servo_id: int) -> tuple[FeetechModel, int, str]:
         if data == before:
             break
         before = data
-    little, big = data[3] | data[4] << 8, data[3] << 8 | data[4]
-    firmware = f"{data[0]}.{data[1]}"
-    for number, registers in ((little, STS), (big, SCS)):
-        model = MODELS_BY_NUMBER.get(number)
-        if model is not None and model.registers is registers:
-            return model, number, firmware
-    return (MODELS["SCS"], big, firmware) if data[2] == 1 else (MODELS["STS"], little, firmware)
+    if data[2] == 1:
+        raise WrongDevice(f"servo {servo_id} on {link.name} is an SCS, which mastctl does not drive")
+    number = data[3] | data[4] << 8
+    return MODELS_BY_NUMBER.get(number, MODELS["STS"]), number, f"{data[0]}.{data[1]}"
 
 
 def facts(link: FeetechLink, servo_id: int) -> ServoFacts:
     """Read every register of a servo that the table knows. Raises NoReply, BadReply, LineLost."""
     model, number, firmware = identify(link, servo_id)
-    registers = model.registers.values()
-    end = max(register.address + register.size for register in registers)
-    data = again(link, lambda: link.block(servo_id, 0, end))
-    values = {r.name: r.decode(data[r.address : r.address + r.size]) for r in registers}
+    data = again(link, lambda: link.block(servo_id, 0, END))
+    values = {r.name: r.decode(data[r.address : r.address + r.size]) for r in REGISTERS.values()}
     name = model.name if model.number else f"{model.name} (number {number}, not in the table)"
     return ServoFacts(servo_id, name, firmware, values, _meanings(model, values))
 
@@ -492,15 +418,13 @@ def _meanings(model: FeetechModel, values: Mapping[str, int]) -> dict[str, str]:
     for name in ("max_voltage_limit", "min_voltage_limit", "present_voltage"):
         found[name] = f"{values[name] / 10:.1f} V"
     for name in ("max_torque", "torque_limit", "present_load"):
-        if name in values:
-            found[name] = f"{values[name] / 10:.1f} %"
+        found[name] = f"{values[name] / 10:.1f} %"
     found["baud"] = f"{BAUD_RATES[values['baud']]} baud" if values["baud"] < len(BAUD_RATES) else "unknown"
     found["status"] = " and ".join(status_faults(values["status"])) or "well"
     found["torque_enable"] = "on" if values["torque_enable"] else "off"
     found["lock"] = "EEPROM locked" if values["lock"] else "EEPROM unlocked"
-    if "offset" in values:
-        turn = f"{math.degrees(values['offset'] * model.count_rad):.3f} deg"
-        found["offset"] = f"{turn}, part of every position; mastctl never writes it"
+    turn = f"{math.degrees(values['offset'] * model.count_rad):.3f} deg"
+    found["offset"] = f"{turn}, part of every position; mastctl never writes it"
     return found
 
 
@@ -514,13 +438,13 @@ def set_id(
     NoReply, BadReply, LineLost if it cannot be reached, before or afterwards.
     """
     check_change(link, old, new, new_baud, BAUD_RATES)
-    model, _, _ = identify(link, old)
+    identify(link, old)
     if old != new:
         with suppress(NoReply):
             link.ping(new)
             raise WrongDevice(f"id {new} is taken by another servo; choose another")
         link.quiet(0.05)
-    registers = model.registers
+    registers = REGISTERS
     if link.proven(old, registers["torque_enable"]):
         if not torque_off:
             raise WrongDevice(

@@ -32,7 +32,7 @@ from mastctl.testing.drivers.head_trial import HeadTrial
 REAL = [name for name in RIGS if name != "in_memory"]
 WIRES = ["dynamixel", "feetech", "ptu"]
 OTHER = pytest.mark.long(2, "its session is that of Dynamixel's, and quick where a line is wanted (feetech)")
-LATER = ("feetech", "scs")
+LATER = ("feetech", "feetech_echo")
 SAME = [pytest.param(name, marks=OTHER) for name in LATER]
 QUICK = [name for name in TURNED if name not in LATER]
 MADE = {**RIGS, **TURNED}
@@ -45,7 +45,7 @@ def rig(request: pytest.FixtureRequest) -> Iterator[HeadRig]:
         yield made
 
 
-@pytest.fixture(params=[*WIRES, pytest.param("scs", marks=OTHER)])
+@pytest.fixture(params=[*WIRES, pytest.param("feetech_echo", marks=OTHER)])
 def wired(request: pytest.FixtureRequest) -> Iterator[HeadRig]:
     with MADE[request.param]() as made:
         yield made

@@ -8,7 +8,7 @@ from hil_tests.support.servo_campaign import WORDS, ReadingJudge, ServoRow, run_
 from hil_tests.support.servo_rigs import in_memory
 
 OTHER = pytest.mark.long(3, "the same of other heads; the bus and session of Feetech's are Dynamixel's")
-LATER = [pytest.param(name, marks=OTHER) for name in ("feetech", "feetech_echo", "scs")]
+LATER = [pytest.param(name, marks=OTHER) for name in ("feetech", "feetech_echo")]
 
 
 @pytest.mark.parametrize("driver", ["dynamixel", "ptu", *LATER])

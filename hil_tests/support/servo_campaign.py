@@ -33,7 +33,6 @@ DRIVERS: dict[str, Callable[[], AbstractContextManager[HeadRig]]] = {
     "dynamixel": partial(dynamixel, watchdog_s=0.3, reply_timeout_s=0.05, turned=True),
     "feetech": partial(feetech, lease_s=0.2, reply_timeout_s=0.05, turned=True),
     "feetech_echo": partial(feetech, lease_s=0.2, reply_timeout_s=0.05, echoes=True, turned=True),
-    "scs": partial(feetech, "SCS0009", lease_s=0.2, reply_timeout_s=0.05, turned=True),
     "ptu": partial(ptu, turned=True),
 }
 """All on a turned clock, without real time."""

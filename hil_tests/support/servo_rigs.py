@@ -322,7 +322,7 @@ TURNED: dict[str, Callable[[], Any]] = {
     "in_memory": partial(in_memory, turned=True),
     "dynamixel": partial(dynamixel, turned=True),
     "feetech": partial(feetech, lease_s=0.2, reply_timeout_s=0.1, turned=True),
-    "scs": partial(feetech, "SCS0009", reply_timeout_s=0.1, echoes=True, turned=True),
+    "feetech_echo": partial(feetech, reply_timeout_s=0.1, echoes=True, turned=True),
     "ptu": partial(ptu, turned=True),
 }
 """On a turned clock."""

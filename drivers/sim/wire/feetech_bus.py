@@ -134,7 +134,7 @@ class FeetechBus:
         address, length = parameters[:2]
         replies = []
         for servo_id in parameters[2:]:
-            servo = next((s for s in here if s.servo_id == servo_id and s.model.sync_read), None)
+            servo = next((s for s in here if s.servo_id == servo_id), None)
             if servo is None:
                 break
             data = servo.read(address, length, time_s)

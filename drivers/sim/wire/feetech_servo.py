@@ -1,7 +1,7 @@
 """One simulated Feetech servo: its memory, its motion, its protection. It has no watchdog.
 
 The memory tables were written down from the maker's manuals, not from the driver: Feetech's memory tables of
-STS/SMS and SCSCL servos, and the addresses in the maker's SDK. A row is ``address size name access initial
+STS/SMS servos, and the addresses in the maker's SDK. A row is ``address size name access initial
 low high``; ``w`` is readable and writable. What no row names reads as zero: gains, dead bands and the like.
 """
 
@@ -56,35 +56,22 @@ _OF_STS = """
 48 2 torque_limit        w 1000  0 1000
 55 1 lock                w 1     0 1
 """
-_OF_SCS = """
- 1 1 firmware_minor      r 6
- 9 2 min_angle           w 0     0 1023
-11 2 max_angle           w 1023  0 1023
-14 1 max_voltage         w 100   0 254
-19 1 unload_condition    w 36    0 254
-37 1 protective_torque   w 40    0 100
-38 1 protective_time     w 80    0 254
-42 2 goal_position       w -     0 1023
-48 1 lock                w 1     0 1
-"""
 BAUDS = (1_000_000, 500_000, 250_000, 128_000, 115_200, 76_800, 57_600, 38_400)
-"""Bits a second by code: address 6 of the maker's memory tables of STS and SCSCL servos."""
+"""Bits a second by code: address 6 of the maker's memory tables of STS servos."""
 
 RAM_FROM = 40
 
 
 @dataclass(frozen=True)
 class SimulatedFeetech:
-    """One model of servo; with ``sync_read`` it answers a read of several servos at once."""
+    """One model of servo."""
 
     name: str
     number: int
     cells: tuple[TableRegister, ...]
-    big_end: bool
-    turn_rad: float
-    counts: int
-    sync_read: bool
-    volts: float
+    turn_rad: float = math.tau
+    counts: int = 4096
+    volts: float = 12.0
 
     @property
     def count_rad(self) -> float:
@@ -97,12 +84,11 @@ class SimulatedFeetech:
         return {cell.name: cell for cell in self.cells}
 
 
-_STS, _SCS = table_of(_COMMON + _OF_STS), table_of(_COMMON + _OF_SCS)
+_STS = table_of(_COMMON + _OF_STS)
 MODELS: Mapping[str, SimulatedFeetech] = {
-    "sts3215": SimulatedFeetech("sts3215", 777, _STS, False, math.tau, 4096, True, 12.0),
-    "sts3250": SimulatedFeetech("sts3250", 2825, _STS, False, math.tau, 4096, True, 12.0),
-    "sm8512bl": SimulatedFeetech("sm8512bl", 11272, _STS, False, math.tau, 4096, True, 12.0),
-    "scs0009": SimulatedFeetech("scs0009", 1284, _SCS, True, math.radians(300), 1024, False, 6.0),
+    "sts3215": SimulatedFeetech("sts3215", 777, _STS),
+    "sts3250": SimulatedFeetech("sts3250", 2825, _STS),
+    "sm8512bl": SimulatedFeetech("sm8512bl", 11272, _STS),
 }
 """Every model that can be simulated."""
 
@@ -125,7 +111,7 @@ FASTEST_COUNTS = 3400
 """Counts per second of a goal speed of 0 (assumed: the no-load speed of an STS3215)."""
 
 STEEPEST_RAD_PER_S2 = 60.0
-"""Of an acceleration of 0, and of an SCS, which has none (assumed)."""
+"""Of an acceleration of 0 (assumed)."""
 
 _PROTECTIVE_UNIT_S = 0.01
 
@@ -228,9 +214,8 @@ class SimulatedFeetechServo:
         """Return bytes of the memory; zeros where the table has nothing."""
         self._measure(time_s)
         data = bytearray(256)
-        order = "big" if self.model.big_end else "little"
         for cell in self.model.cells:
-            word = self.memory[cell.name].to_bytes(cell.size, order)  # type: ignore[arg-type]
+            word = self.memory[cell.name].to_bytes(cell.size, "little")
             data[cell.address : cell.address + cell.size] = word
         return bytes(data[address : address + length])
 
@@ -242,7 +227,7 @@ class SimulatedFeetechServo:
             if not cell.writable or at < 0 or at + cell.size > len(data):
                 continue
             word = data[at : at + cell.size]
-            value = int.from_bytes(word, "big" if self.model.big_end else "little")
+            value = int.from_bytes(word, "little")
             if cell.low <= value <= cell.high:
                 self._put(cell.name, value, cell.address, time_s)
                 moved = moved or cell.name in ("goal_position", "torque_enable")

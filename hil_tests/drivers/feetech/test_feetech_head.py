@@ -237,9 +237,8 @@ def test_a_series_takes_a_servo_that_is_not_in_the_table() -> None:
         head.close()
 
 
-@pytest.mark.parametrize("model", ["sts3215", "scs0009"])
-def test_an_adapter_that_echoes_is_found_out_and_costs_nothing(model: str) -> None:
-    with opened(model, echoes=True) as (it, head):
+def test_an_adapter_that_echoes_is_found_out_and_costs_nothing() -> None:
+    with opened(echoes=True) as (it, head):
         head.move(0.3, 0.1)
         assert it.settled(head).pan_rad == pytest.approx(0.3, abs=0.004)
         began_s = it.now_s()

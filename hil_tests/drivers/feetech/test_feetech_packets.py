@@ -15,7 +15,6 @@ OF_THE_SDK = {
     "ping": "ff ff 01 02 01 fb",
     "read 56, 8 bytes": "ff ff 01 04 02 38 08 b8",
     "write 2048 to 42": "ff ff 01 05 03 2a 00 08 c4",
-    "write 500 to 42, SCS": "ff ff 01 05 03 2a 01 f4 d7",
     "sync write": "ff ff fe 14 83 29 07 01 32 00 08 00 00 60 09 02 32 0a 08 00 00 60 09 e7",
     "sync read": "ff ff fe 06 82 38 08 01 02 36",
 }
@@ -23,15 +22,13 @@ OF_THE_SDK = {
 
 def ours() -> dict[str, bytes]:
     """The same by the driver."""
-    sts, scs = packets.MODELS["STS3215"], packets.MODELS["SCS0009"]
-    goal, of_scs = (model.registers["goal_position"] for model in (sts, scs))
+    goal = packets.REGISTERS["goal_position"]
     told = [goal.encode(count) + bytes((0, 0, 0x60, 9)) for count in (2048, 2058)]
     write, read = packets.WRITE, bytes((56, 8))
     return {
         "ping": packets.instruction_packet(1, packets.PING),
         "read 56, 8 bytes": packets.instruction_packet(1, packets.READ, read),
         "write 2048 to 42": packets.instruction_packet(1, write, b"\x2a" + goal.encode(2048)),
-        "write 500 to 42, SCS": packets.instruction_packet(1, write, b"\x2a" + of_scs.encode(500)),
         "sync write": packets.group_write_packet([Part(n, 41, 7, b"\x32" + told[n - 1]) for n in (1, 2)]),
         "sync read": packets.sync_read_packet(56, 8, (1, 2)),
     }
@@ -75,10 +72,9 @@ def test_a_reply_in_pieces_is_awaited_and_a_broken_one_dropped() -> None:
     assert renamed(reply, 2) == packet(2, 0, b"abc")
 
 
-def test_minus_is_a_bit_and_an_scs_is_big_endian() -> None:
-    registers = packets.MODELS["STS3215"].registers
+def test_minus_is_a_bit() -> None:
+    registers = packets.REGISTERS
     offset, position = registers["offset"], registers["present_position"]
     assert offset.encode(-100) == (0x800 | 100).to_bytes(2, "little")
     assert offset.decode(offset.encode(-100)) == -100
     assert position.decode(bytes((0x05, 0x80))) == -5
-    assert packets.SCS["present_position"].decode(bytes((0x01, 0xF4))) == 500
