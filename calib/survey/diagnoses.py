@@ -77,7 +77,17 @@ def wrong_points(survey: Survey) -> Iterator[SurveyFinding]:
 
 
 def wrong_dots(survey: Survey) -> Iterator[SurveyFinding]:
-    """Yield grids that are seen in a mirror."""
+    """Yield images that share their dots, and grids that are seen in a mirror."""
+    first_with: dict[bytes, str] = {}
+    for name, dots in survey.dots.items():
+        first = first_with.setdefault(dots.pixels_px.tobytes(), name)
+        if first != name:
+            yield SurveyFinding(
+                "error",
+                f"dots.csv, image {name}",
+                f"its dots are the very same as those of image {first}",
+                "One is a copy: find the dots of this image again",
+            )
     spreads = {name: _dots_per_board(survey, dots) for name, dots in survey.dots.items()}
     flipped = [name for name, spread in spreads.items() if spread is not None and np.linalg.det(spread) < 0]
     if flipped:

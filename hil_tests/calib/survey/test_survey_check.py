@@ -336,6 +336,13 @@ def test_one_wrong_prism_is_no_matter_of_units(good: Survey, shift_m: float) -> 
     assert "prism p2" in finding.message
 
 
+def test_images_that_share_their_dots_are_named(good: Survey) -> None:
+    first, second = good.images[0].name, good.images[2].name
+    dots = dict(good.dots) | {second: good.dots[first]}
+    copied = [f for f in check_survey(replace(good, dots=dots)) if "very same" in f.message]
+    assert f"those of image {first}" in only(tuple(copied)).message
+
+
 def test_it_answers_for_any_survey_that_can_be_read(good: Survey) -> None:
     """Parts taken away at random: always an answer, never an exception."""
     rng = np.random.default_rng(0)
