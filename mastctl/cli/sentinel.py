@@ -47,8 +47,8 @@ def _steering(args: argparse.Namespace, client: Client) -> Iterator[None]:
     example="--folder sentinel --pose 0,-0.3",
 )
 def _reference(args: argparse.Namespace) -> Answer:
-    from mastctl.watch.looks import head_cameras, now_utc, take_pictures, usual_rests
-    from mastctl.watch.sentinel import save_reference
+    from mastctl.watch.looks import head_cameras, take_pictures, usual_rests
+    from mastctl.watch.sentinel import now_utc, save_reference
 
     with client_of(args) as client, _steering(args, client):
         rests = args.pose or usual_rests(client)
@@ -60,7 +60,7 @@ def _reference(args: argparse.Namespace) -> Answer:
     if taken.missing:
         which, why = next(iter(taken.missing.items()))
         raise CommandError("no_picture", f"no reference was taken: {which}: {why}")
-    saved = save_reference(args.folder, now_utc().isoformat(timespec="seconds"), rests, taken.pictures)
+    saved = save_reference(args.folder, now_utc(), rests, taken.pictures)
     document = {
         "folder": str(args.folder), "pictures": len(saved.pictures), "rests": [list(rest) for rest in rests]
     }  # fmt: skip
@@ -75,7 +75,7 @@ def _reference(args: argparse.Namespace) -> Answer:
     example="--folder sentinel",
 )
 def _look(args: argparse.Namespace) -> Answer:
-    from mastctl.watch.looks import look_again, now_utc
+    from mastctl.watch.looks import look_again
     from mastctl.watch.sentinel import add_look, read_reference
 
     reference = read_reference(args.folder)
@@ -85,15 +85,14 @@ def _look(args: argparse.Namespace) -> Answer:
         output.waiting(args.json, f"comparing {len(reference.rests)} poses"),
     ):
         drift = look_again(client, reference)
-    return _standing(args, add_look(args.folder, reference, now_utc().isoformat(timespec="seconds"), drift))
+    return _standing(args, add_look(args.folder, reference, drift))
 
 
 def _standing(args: argparse.Namespace, look: dict[str, Any] | None) -> Answer:
-    from mastctl.watch.looks import now_utc
     from mastctl.watch.sentinel import read_looks, read_reference, standing
 
     reference = read_reference(args.folder)
-    now = standing(reference, read_looks(args.folder, reference), now_utc())
+    now = standing(reference, read_looks(args.folder, reference))
     document = {name: now[name] for name in ("level", "sentence", "since", "looks")} | {"look": look}
     missing = [f"{which}: no picture: {why}" for which, why in (look or {}).get("missing", {}).items()]
     return Answer(document, [now["sentence"], *missing], 1 if now["level"] == "bad" else 0)

@@ -54,20 +54,10 @@ NEXT_RUN = "another run begins"
 class Recorder:
     """Records what is published, and runs that are begun and ended; safe to use from any thread.
 
-    Parameters
-    ----------
-    mast
-        Returns the mast file in use.
-    others
-        What is attached beside it: the configuration.
-    facts
-        Of each file: ``hardware``, its kind; ``version``.
-    frame_by_id
-        Where the images are; raises MastctlError for one that is gone.
-    event_value
-        Returns a published value of a topic as events have it.
-    clock
-        The daemon's, which stamps what is recorded. The disk's own times go by the machine's.
+    ``mast`` returns the mast file in use; ``others`` are attached beside it. ``facts`` of each file:
+    ``hardware``, its kind; ``version``. ``frame_by_id`` returns a frame with its image, or raises
+    MastctlError; ``event_value`` a published value as events have it. ``clock``, the daemon's, stamps what is
+    recorded; the disk's own times go by the machine's.
     """
 
     def __init__(
@@ -117,7 +107,7 @@ class Recorder:
     def add_handoff(self, line: dict[str, Any]) -> None:
         """Record a hand-off, a line of the log of hand-offs."""
         entry = Entry("handoff", line["time"], line, self._clock.now_s())
-        self._request(lambda: self._write([entry], time.monotonic()))
+        self._requests.put((lambda: self._write([entry], time.monotonic()), Future()))
 
     def summary(self) -> RecorderState:
         """Return what is recorded now."""
@@ -154,9 +144,8 @@ class Recorder:
         return tuple(found)
 
     def file(self, name: str, file: str) -> Path:
-        """Return a file of a recording, by the names that `listing` has.
-
-        Raises NotKnown ``recording_unknown``, NotNow ``recording`` while it is written, Unable.
+        """Return a file of a recording, by the names that `listing` has. Raises NotKnown, Unable, and NotNow
+        while it is written.
         """
         found = next((path for path in self._found(name).files if readable(path.name) == file), None)
         if found is None:
@@ -167,25 +156,17 @@ class Recorder:
         return found
 
     def delete(self, name: str) -> RecordingDeleted:
-        """Delete a run, or what a fault kept; return the recordings that are left.
-
-        Raises NotKnown ``recording_unknown``, NotNow ``recording`` for the run that is recorded and for the
-        ring, Unable ``unwritable``, ``unreadable``, ``slow``.
+        """Delete a run, or what a fault kept; return the recordings that are left. The run that is recorded,
+        and the ring, are refused. Raises NotKnown, NotNow, Unable.
         """
         return self._result(lambda: self._delete(name))
 
     def start_run(self, name: str) -> RecorderState:
-        """Begin a run and return `summary`.
-
-        Raises NotNow ``recording`` if one is recorded already, Unable ``unwritable``, ``disk_low``, ``slow``.
-        """
+        """Begin a run and return `summary`. Raises NotNow if one is recorded already, Unable."""
         return self._result(lambda: self._start_run(name))
 
     def stop_run(self) -> RecordingEnded:
-        """End the run and return its name and size; what is recorded then is the ring again.
-
-        Raises NotNow ``not_recording``, Unable ``run_gone`` if its file was removed, ``slow``.
-        """
+        """End the run and return its name and size; the ring goes on. Raises NotNow, Unable."""
         return self._result(self._stop_run)
 
     def close(self) -> None:
@@ -196,19 +177,14 @@ class Recorder:
         if self._thread.is_alive():
             log.error("%s does not answer; the newest second is not recorded", self._folder.path)
 
-    def _request(self, act: Callable[[], T]) -> Future[T]:
-        """Have the writing thread do something."""
-        answer: Future[T] = Future()
-        if self._closing:
-            answer.set_exception(Unable("closing", "the service is closing"))
-        else:
-            self._requests.put((act, answer))
-        return answer
-
     def _result(self, act: Callable[[], T]) -> T:
         """Have the writing thread do something, and wait for its result."""
+        if self._closing:
+            raise Unable("closing", "the service is closing")
+        answer: Future[T] = Future()
+        self._requests.put((act, answer))
         try:
-            return self._request(act).result(ANSWER_S)
+            return answer.result(ANSWER_S)
         except TimeoutError:
             message = f"{self._folder.path} did not answer within {ANSWER_S:g} s; the recorder goes on trying"
             raise Unable("slow", message) from None
@@ -294,21 +270,25 @@ class Recorder:
             if file is not None and self._gone(file):
                 return  # that is the reason
         reason = f"{self._folder.path} cannot be written: {error.strerror or error}"
-        self._stop_writing("unwritable", reason, "it can be written again", again_s=RETRY_S)
+        self._stop_writing("unwritable", reason, "it can be written again")
         if file is not None:
             with contextlib.suppress(OSError):
                 file.abandon()
 
-    def _stop_writing(self, code: str, reason: str, until: str, again_s: float = 0.0) -> None:
-        """Record nothing until a run begins, or for some seconds, and report the fault."""
+    def _stop_writing(self, code: str, reason: str, until: str = NEXT_RUN) -> RecordFile | None:
+        """End the run; record nothing for some seconds if a disk may recover; report the fault, and return
+        the file that is to be closed.
+        """
         ended = "nothing is recorded" if self._run is None else f"the run {self._run} has ended"
         before, message = self._fault, f"{reason}; {ended}"
         same = before is not None and before.code == code
         since_s = before.since_s if before is not None and same else self._clock.now_s()
         self._fault = StandingFault(NAME, code, message, since_s, until)
-        self._file, self._run, self._retry_s = None, None, time.monotonic() + again_s
+        file, self._file, self._run = self._file, None, None
+        self._retry_s = 0.0 if until == NEXT_RUN else time.monotonic() + RETRY_S
         if not same:
             log.error("%s", message)
+        return file
 
     def _write(self, entries: list[Entry], since_s: float) -> None:
         """Write what was published since a moment into the file, if there is one to be written."""
@@ -373,7 +353,7 @@ class Recorder:
         self._judged_bytes = file.size
         if self._run is not None:
             if file.size > self._settings.run_mb * MB:
-                self._stop_writing("run_full", f"the file has {self._settings.run_mb:g} MB", NEXT_RUN)
+                self._stop_writing("run_full", f"the file has {self._settings.run_mb:g} MB")
                 file.finish()
         elif (
             now_s - self._begun_s > self._ring_s / SEGMENTS
@@ -391,7 +371,7 @@ class Recorder:
             log.warning("another segment of the ring begins: %s", reason)
             self._file = None
         else:
-            self._stop_writing("run_gone", reason, NEXT_RUN)
+            self._stop_writing("run_gone", reason)
         file.finish(wait=False)
         return True
 
@@ -405,9 +385,7 @@ class Recorder:
                 f"the disk of {self._folder.path} has {free / MB:.0f} MB free where "
                 f"{self._settings.free_mb:g} MB are left to others"
             )
-            file = self._file
-            self._stop_writing("disk_low", reason, "the disk has more space", again_s=RETRY_S)
-            if file is not None:
+            if file := self._stop_writing("disk_low", reason, "the disk has more space"):
                 file.finish()
             return True
         return False

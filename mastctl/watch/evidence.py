@@ -6,7 +6,7 @@ that stand: one camera was turned by some angle, of which nothing is known but i
 is some times as wrong as expected. The ratio of the likelihoods, averaged over all of these, has the mean 1
 while the mast file holds, and is a martingale as pointings come in: the chance that it *ever* reaches k is at
 most 1/k (Ville's inequality; Ramdas et al., "Game-theoretic statistics and safe anytime-valid inference",
-2023). So it may be looked at after each pointing, and the false alarms do not add up.
+2023). So it may be judged after each pointing, and the false alarms do not add up.
 
 The pointings enter by sums only (`Sums`), which add up over time. What is judged of one is not the whole
 residual but what is left of it beside the joints: where the picture shows the target, less where position,
@@ -20,7 +20,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from pydantic import ConfigDict, TypeAdapter, with_config
@@ -42,15 +41,11 @@ DISAGREE = "eyes_disagree"
 
 @with_config(ConfigDict(extra="forbid", allow_inf_nan=False))
 class Measured(MeasuredPointing):
-    """A pointing of which a new picture was taken, as the journal has it."""
+    """A pointing of which a new image was taken, as the journal has it."""
 
 
-_MEASURED = TypeAdapter(Measured)
-
-
-def measured_of(record: Any) -> Measured:
-    """Return the pointing of a line of the journal. Raises ValueError for anything else."""
-    return _MEASURED.validate_python(record)
+measured_of = TypeAdapter(Measured).validate_python
+"""Returns the pointing of a line of the journal; raises ValueError for anything else."""
 
 
 def measured_by(operation: Operation, mast: StoredRig, time_s: float) -> Measured | None:
@@ -236,15 +231,9 @@ UNMODELLED_PX = 0.1
 class Expected(ReadOnlyArrays):
     """A pointing's residual by what it depends on.
 
-    Attributes
-    ----------
-    noise_px2
-        (2, 2) what differs from pointing to pointing: matches, counts.
-    rates
-        (2, p) by each of the rig's parameters that were requested.
-    turned
-        (2, 3 c) px/rad by a turn of each of the cameras that were requested about x, y and z of the frame
-        that it is mounted on.
+    ``noise_px2``: (2, 2) what differs from pointing to pointing, matches and counts. ``rates``: (2, p) by
+    each requested parameter. ``turned``: (2, 3 c) px/rad by a turn of each requested camera about x, y and z
+    of the frame that it is mounted on.
     """
 
     noise_px2: FloatArray

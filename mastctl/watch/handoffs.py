@@ -257,24 +257,17 @@ class HandoffCheck:
 
     def _read(self) -> None:
         assert self._journal is not None
-        try:
-            before = self._journal.read()
-        except BadFile as error:
-            log.error("%s; earlier hand-offs do not count", " ".join(str(error).split()))
-            return
+        earlier = self._journal.earlier()
 
         def join() -> None:
-            self._handoffs = deque((*before, *self._handoffs), maxlen=KEPT)
+            self._handoffs = deque((*earlier, *self._handoffs), maxlen=KEPT)
 
         self._judge(join)
 
     def _write(self, handoff: MatchedHandoff) -> None:
         assert self._journal is not None
-        reason, before = self._journal.keep(handoff), self._fault
-        self._fault = None
-        if reason:
-            message = f"{reason}; hand-offs count, and wait to be logged"
-            if before is None:
-                log.error("%s", message)
-            since_s = self._clock.now_s() if before is None else before.since_s
-            self._fault = StandingFault(NAME, "unwritable", message, since_s, "a hand-off is logged")
+        self._journal.keep(handoff)
+        reason, since_s = self._journal.unwritten, self._fault.since_s if self._fault else self._clock.now_s()
+        self._fault = (
+            StandingFault(NAME, "unwritable", reason, since_s, "a hand-off is logged") if reason else None
+        )

@@ -33,19 +33,9 @@ CLOSE_S = 2.0
 class Journal(Generic[T]):
     """A file of records; several processes may append to one that has no bound.
 
-    Parameters
-    ----------
-    path
-        Made by the first `append`, its folder too.
-    what
-        The records in the plural, for messages.
-    to_json, from_json
-        A record's object, and the record of an object; ``from_json`` raises ValueError, TypeError,
-        LookupError or BadFile for anything else.
-    begins
-        How each line begins; a file that begins otherwise is not appended to.
-    most_bytes
-        At which the file is written anew with the records that still count; None: never.
+    ``what`` names the records in the plural; ``from_json`` raises ValueError, TypeError, LookupError or
+    BadFile for what is no record. A file that does not begin with ``begins`` is not appended to; at
+    ``most_bytes`` it is written anew with the records that still count. ``unwritten`` says why records wait.
     """
 
     def __init__(
@@ -58,6 +48,7 @@ class Journal(Generic[T]):
         self._begins = begins
         self._most_bytes = most_bytes
         self._waiting: deque[T] = deque(maxlen=MOST_WAITING)
+        self.unwritten = ""
 
     def read(self) -> list[T]:
         """Return the records, oldest first; lines that are none are left out, and logged. Raises BadFile."""
@@ -75,6 +66,14 @@ class Journal(Generic[T]):
             left_out = len(lines) - len(records)
             log.warning("%s: %d of %d lines are no %s", self.path, left_out, len(lines), self._what)
         return records
+
+    def earlier(self) -> list[T]:
+        """Return the records, oldest first; none, and a line in the log, if the file cannot be read."""
+        try:
+            return self.read()
+        except BadFile as error:
+            log.error("%s; earlier %s do not count", _on_one_line(error), self._what)
+            return []
 
     def append(self, record: T, counting: Sequence[T] = ()) -> bool:
         """Add a record; it is on the disk, whole, when this returns.
@@ -95,9 +94,10 @@ class Journal(Generic[T]):
         except OSError as error:
             raise BadFile(self.path, "", f"cannot be written: {error.strerror or error}") from None
 
-    def keep(self, record: T, counting: Sequence[T] = ()) -> str:
-        """Append a record and those that wait, oldest first; return why some still wait, empty if none."""
+    def keep(self, record: T, counting: Sequence[T] = ()) -> None:
+        """Append a record and those that wait, oldest first; what cannot be written yet waits."""
         self._waiting.append(record)
+        before, reason = self.unwritten, ""
         try:
             while self._waiting:
                 try:
@@ -108,11 +108,17 @@ class Journal(Generic[T]):
                     log.error("%s: a record cannot be kept: %s", self.path, error)
                 self._waiting.popleft()
         except BadFile as error:
-            return " ".join(str(error).split())
-        return ""
+            reason = f"{_on_one_line(error)}; {self._what} count, and wait to be written"
+        self.unwritten = reason
+        if reason and not before:
+            log.error("%s", reason)
 
     def _line(self, record: T) -> bytes:
         return (json.dumps(self._to_json(record), allow_nan=False) + "\n").encode()
+
+
+def _on_one_line(error: BadFile) -> str:
+    return " ".join(str(error).split())
 
 
 class JournalThread:

@@ -54,8 +54,8 @@ def usual_rests(client: Client) -> list[tuple[float, float]]:
     return [(pan, tilt) for tilt in dict.fromkeys(tilts) for pan in pans]
 
 
-def is_idle(client: Client, for_s: float = 0.0) -> str:
-    """Return '' where a look disturbs no client, else why; ``for_s``: how long the head must be unused."""
+def _in_use(client: Client, for_s: float) -> str:
+    """Why the head is in use, '' if it is idle and was not used for some seconds."""
     if (control := client.control()) is not None:
         return f"{control['holder']} steers"
     status = client.status()
@@ -66,12 +66,7 @@ def is_idle(client: Client, for_s: float = 0.0) -> str:
     return "" if since_s >= for_s else f"the head was used {since_s:.0f} s ago; {for_s:.0f} s are waited for"
 
 
-def take_pictures(
-    client: Client,
-    rests: Sequence[Sequence[float]],
-    cameras: Sequence[str],
-    progress: Callable[[int, int], None] | None = None,
-) -> Taken:
+def take_pictures(client: Client, rests: Sequence[Sequence[float]], cameras: Sequence[str]) -> Taken:
     """Return a picture of each camera at each rest (pan, tilt as read), and bring the head back.
 
     The client should hold the lease. A camera that gives no image is left out; the others go on. Raises
@@ -100,15 +95,13 @@ def take_pictures(
                 taken.pictures.append(
                     ReferencePicture(camera, pose, *shot.true_rad, shot.mast_digest, grey(shot.image))
                 )
-            if progress is not None:
-                progress(pose + 1, len(rests))
+        if joints is not None:
+            _turn(client, joints["pan_rad"], joints["tilt_rad"])
     except ClientError:
         if joints is not None:
             with suppress(ClientError, LookEnded):  # refused if another client steers by now
-                _turn(client, float(joints["pan_rad"]), float(joints["tilt_rad"]))
+                _turn(client, joints["pan_rad"], joints["tilt_rad"])
         raise
-    if joints is not None:
-        _turn(client, float(joints["pan_rad"]), float(joints["tilt_rad"]))
     return taken
 
 
@@ -128,9 +121,7 @@ def head_cameras(client: Client) -> tuple[Rig, list[str]]:
     return rig, [name for name, camera in rig.cameras.items() if camera.on == "head" and name in served]
 
 
-def look_again(
-    client: Client, reference: Reference, progress: Callable[[int, int], None] | None = None
-) -> SceneDrift:
+def look_again(client: Client, reference: Reference) -> SceneDrift:
     """Take the pictures of a reference again and return what has changed.
 
     Nothing moves before it is known that the reference can be compared with. Raises LookEnded if another mast
@@ -146,26 +137,16 @@ def look_again(
             f"the reference is of {', '.join(reference.cameras) or 'no camera'}, the daemon has "
             f"{', '.join(served) or 'no camera on the head'}; take a new one"
         )
-    taken = take_pictures(client, reference.rests, cameras, progress)
+    taken = take_pictures(client, reference.rests, cameras)
     if any(one.mast_digest != reference.mast_digest for one in taken.pictures):
         raise LookEnded("another mast file came into use during the look; nothing was kept")
-    drift = compared(rig, reference, taken.pictures)
+    drift = find_drift(rig, _view_shifts(rig, reference, taken.pictures), JOINT_SIGMA_RAD)
     gone = {name: "not configured any more" for name in reference.cameras if name not in served}
     return replace(drift, missing=gone | taken.missing)
 
 
-def compared(
-    rig: Rig,
-    reference: Reference,
-    pictures: Sequence[ReferencePicture],
-    joint_sigma_rad: float = JOINT_SIGMA_RAD,
-) -> SceneDrift:
-    """Return what has changed between a reference and new pictures. Raises as `view_shifts`."""
-    return find_drift(rig, view_shifts(rig, reference, pictures), joint_sigma_rad)
-
-
-def view_shifts(rig: Rig, reference: Reference, pictures: Sequence[ReferencePicture]) -> list[ViewShift]:
-    """Return how far the features of a reference have moved in new pictures. Raises BadFile, LookEnded."""
+def _view_shifts(rig: Rig, reference: Reference, pictures: Sequence[ReferencePicture]) -> list[ViewShift]:
+    """How far the features of a reference have moved in new pictures. Raises BadFile, LookEnded."""
     shifts = []
     for now in pictures:
         then = reference.picture(now.camera, now.pose)
@@ -181,8 +162,7 @@ def view_shifts(rig: Rig, reference: Reference, pictures: Sequence[ReferencePict
             )
         pixels, moved, sigma = seen_again(model, then.image, now.image)
         if len(pixels):
-            # a pose that the head itself reports as another is no drift
-            moved = moved - _reported_px(rig, then, now, pixels)
+            moved = moved - _reported_px(rig, then, now, pixels)  # what the head itself reports is no drift
         shifts.append(ViewShift(now.camera, now.pose, then.pan_rad, then.tilt_rad, pixels, moved, sigma))
     return shifts
 
@@ -203,11 +183,6 @@ RETRY_S = 60.0
 NAME = "sentinel"
 
 
-def now_utc() -> datetime:
-    """Return the time of day."""
-    return datetime.now(UTC)
-
-
 def is_due(reference: Reference, last_look: str | None, every_s: float, now: datetime) -> bool:
     """Return whether a look is due: at the reference's time of day, and each ``every_s`` from it on.
 
@@ -222,7 +197,7 @@ def is_due(reference: Reference, last_look: str | None, every_s: float, now: dat
     return turn(now) != turn(datetime.fromisoformat(last).astimezone(UTC))
 
 
-def look_idle(client: Client, reference: Reference) -> SceneDrift:
+def _look_idle(client: Client, reference: Reference) -> SceneDrift:
     """Look under a lease, which ends with a stop of the head. Raises LookEnded."""
     with client.lease(NAME, for_s=LEASE_S, ends_with_stop=True):
         try:
@@ -237,35 +212,33 @@ def look_idle(client: Client, reference: Reference) -> SceneDrift:
 def watch(
     folder: Path,
     connect: Callable[[], AbstractContextManager[Client]],
-    tell: Callable[[str], None],
+    put_off: Callable[[str], None],
     looked: Callable[[dict[str, Any]], None],
     every_s: float,
     idle_s: float,
     sleep: Callable[[float], None] = time.sleep,
-    now: Callable[[], datetime] = now_utc,
 ) -> None:
-    """Look whenever it is due and the head is idle, until interrupted.
+    """Compare whenever it is due and the head is idle, until interrupted.
 
-    ``tell`` gets why there is no look though one is due, each reason once; ``looked`` gets each look. They
+    ``put_off`` gets why nothing is done though it is due, each reason once; ``looked`` gets each result. They
     come every ``every_s`` seconds from the reference's time on, where the head was not used for ``idle_s``.
     Raises BadFile if there is no reference at the start; what fails later is reported, and tried again.
     """
     read_reference(folder)
-    said = ""
+    reported = ""
     while True:
         why = ""
         try:
             reference = read_reference(folder)
             looks = read_looks(folder, reference)
-            if is_due(reference, looks[-1]["time"] if looks else None, every_s, now()):
+            if is_due(reference, looks[-1]["time"] if looks else None, every_s, datetime.now(UTC)):
                 with connect() as client:
-                    why = is_idle(client, idle_s)
+                    why = _in_use(client, idle_s)
                     if not why:
-                        drift = look_idle(client, reference)
-                        looked(add_look(folder, reference, now().isoformat(timespec="seconds"), drift))
+                        looked(add_look(folder, reference, _look_idle(client, reference)))
         except (ClientError, MastctlError, BadFile) as error:
             why = str(error)
-        if why and why != said:
-            tell(f"no look now: {why}")
-        said = why
+        if why and why != reported:
+            put_off(f"no look now: {why}")
+        reported = why
         sleep(min(RETRY_S, every_s / 4.0))

@@ -22,7 +22,7 @@ from typing import Literal
 
 import numpy as np
 
-from calib.errors import BadFile, CalibError
+from calib.errors import CalibError
 from calib.files.mast_file import StoredRig
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
@@ -260,9 +260,8 @@ class CalibrationHealth:
         self._windows: Windows | None = None
         self._judges_by = mast  # in the thread: it comes to the one in use by and by
         self._newest: tuple[Judged, ...] = ()
-        self._not_kept = ""
         self.verdict = residual_verdict("few", TOO_FEW)
-        thread.put(self._read)
+        thread.put(lambda: self._known.extend(self._journal.earlier()))
         thread.put(lambda: self._judge_by(mast))
 
     def ended(self, mast: StoredRig, operation: Operation) -> None:
@@ -287,19 +286,14 @@ class CalibrationHealth:
     @property
     def write_error(self) -> str | None:
         """Why pointings are not kept over a restart, None if they are."""
-        return self._not_kept or None
+        return self._journal.unwritten or None
 
     # In the journals' thread
 
-    def _read(self) -> None:
-        try:
-            self._known.extend(self._journal.read())
-        except BadFile as error:
-            log.error("%s; pointings from before do not count", error)
-
     def _count(self, one: Measured) -> None:
         self._known.append(one)
-        self._keep(one)
+        recent_s = self._wall_s() - DAYS * DAY_S
+        self._journal.keep(one, [kept for kept in self._known if kept["time_s"] > recent_s])
         if self._windows is not None:
             self._windows.add(one)
             self._judge()
@@ -333,10 +327,3 @@ class CalibrationHealth:
             log.warning("the calibration drifts: %s", verdict["sentence"])
         elif before["verdict"] == "drifts" and verdict["verdict"] != "drifts":
             log.info("the calibration does not drift any more: %s", verdict["sentence"])
-
-    def _keep(self, one: Measured) -> None:
-        """Write a pointing to the journal; a failure is logged once."""
-        counting = [kept for kept in self._known if kept["time_s"] > self._wall_s() - DAYS * DAY_S]
-        before, self._not_kept = self._not_kept, self._journal.keep(one, counting)
-        if self._not_kept and not before:
-            log.error("%s; pointings count, and are not kept over a restart", self._not_kept)

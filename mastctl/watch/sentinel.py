@@ -8,6 +8,7 @@ import logging
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import takewhile
@@ -24,6 +25,7 @@ from calib.files import read_bytes, replace_bytes
 from calib.files.records import Moment, Record, Text, problem, read_record
 from calib.matching.warp import Grey, grey
 from mastctl.answers import SentinelTold
+from mastctl.as_json import as_json
 from mastctl.watch.journal import Journal, JournalThread
 
 log = logging.getLogger(__name__)
@@ -169,34 +171,24 @@ def read_reference(folder: Path) -> Reference:
     return reference
 
 
-def add_look(folder: Path, reference: Reference, time: str, drift: SceneDrift) -> dict[str, Any]:
-    """Append what a look at a reference found, and return it. Raises BadFile."""
-    look = look_line(reference, time, drift)
-    try:
-        look_journal(folder).append(look)
-    except BadFile as error:
-        raise BadFile(error.path, error.place, f"{error.reason}; the look is not kept") from None
-    return look
-
-
-def look_journal(folder: Path) -> Journal[dict[str, Any]]:
-    """Return the journal of the looks in a folder."""
-    return Journal(folder / LOOKS, "looks", lambda look: look, _look)
-
-
-def look_line(reference: Reference, time: str, drift: SceneDrift) -> dict[str, Any]:
-    """Return what is kept of a look at a reference."""
-    return {
-        "time": time,
+def add_look(folder: Path, reference: Reference, drift: SceneDrift) -> dict[str, Any]:
+    """Append what was found beside a reference now, and return the line. Raises BadFile."""
+    line = {
+        "time": now_utc(),
         "reference": reference.time,
-        "views": drift.views,
-        "silent": list(drift.silent),
-        "missing": dict(drift.missing),
+        **as_json(drift),
         "changed": drift.changed,
-        "sigmas": drift.sigmas,
-        "moved_px": drift.moved_px,
         "sentence": drift.sentence,
     }
+    try:
+        _journal(folder).append(line)
+    except BadFile as error:
+        raise BadFile(error.path, error.place, f"{error.reason}; the look is not kept") from None
+    return line
+
+
+def _journal(folder: Path) -> Journal[dict[str, Any]]:
+    return Journal(folder / LOOKS, "looks", dict, _look)
 
 
 def read_looks(folder: Path, reference: Reference) -> list[dict[str, Any]]:
@@ -204,7 +196,7 @@ def read_looks(folder: Path, reference: Reference) -> list[dict[str, Any]]:
 
     Raises BadFile if there is a file of looks that cannot be read.
     """
-    return [look for look in look_journal(folder).read() if look.get("reference") == reference.time]
+    return [line for line in _journal(folder).read() if line.get("reference") == reference.time]
 
 
 def _look(value: Any) -> dict[str, Any]:
@@ -219,23 +211,31 @@ def _look(value: Any) -> dict[str, Any]:
 CONFIRMED = 2
 """So many looks one after the other must see a change before it is reported."""
 
-OLD_DAYS = 7.0
-"""What was found by a look longer ago than this is reported with the age first."""
+OLD_S = 7.0 * 86400.0
+"""What was found by a look longer ago than this is reported with the age of the look."""
 
 SILENT = 3
 """So many looks since the last that knew anything, and it is not known any more that all is well."""
 
 
-def standing(reference: Reference, looks: Sequence[Mapping[str, Any]], now: datetime) -> SentinelTold:
-    """Return what the looks at a reference say together; ``now`` for how long ago.
+def now_utc() -> str:
+    """Return the time of day (ISO 8601, to the second)."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def standing(
+    reference: Reference, looks: Sequence[Mapping[str, Any]], now: datetime | None = None
+) -> SentinelTold:
+    """Return what the looks at a reference say together; ``now`` for how long ago, the present by default.
 
     ``bad`` for a change that two looks see, ``unsure`` for no look, one, or silent ones.
     """
+    now = now or datetime.now(UTC)
     level, sentence, since = _judged(reference, looks, now)
     last = looks[-1]["time"] if looks else None
     return {
         "level": level, "sentence": sentence, "looks": len(looks), "since": since, "last_look": last,
-        "age_s": _age_of(last, now), "reference": reference.time,
+        "age_s": last and max(age_s(last, now), 0.0), "reference": reference.time,
     }  # fmt: skip
 
 
@@ -243,81 +243,59 @@ def _judged(
     reference: Reference, looks: Sequence[Mapping[str, Any]], now: datetime
 ) -> tuple[Literal["good", "unsure", "bad"], str, str | None]:
     """The level, its sentence, and the first look that saw the change (ISO 8601)."""
-    telling = [look for look in looks if look["views"]]
-    if not telling:
-        sentence = (
-            f"no look yet at the reference of {ago(reference.time, now)}"
-            if not looks
-            else f"{_looks(len(looks))} saw nothing they knew: night, fog, other light, another place? "
-            f"The last {ago(looks[-1]['time'], now)}"
-        )
-        return "unsure", sentence, None
-    last = telling[-1]
-    silent = len(looks) - 1 - max(at for at, look in enumerate(looks) if look["views"])
+    if not looks:
+        return "unsure", f"no look yet at the reference of {_ago(reference.time, now)}", None
+    clear = [one for one in looks if one["views"]]
+    if not clear:
+        blind = f"{_looks(len(looks))} saw nothing they knew: night, fog, other light, another place?"
+        return "unsure", f"{blind} The last {_ago(looks[-1]['time'], now)}", None
+    last = clear[-1]
+    silent = len(looks) - 1 - max(at for at, one in enumerate(looks) if one["views"])
     blind = f"; {_looks(silent)} since then saw nothing they knew" if silent else ""
-    seen = f"last looked {ago(last['time'], now)}"
+    seen = f"last looked {_ago(last['time'], now)}"
     if not last["changed"]:
-        sentence = f"nothing has changed, {_looks(len(telling))}, {seen}{blind}"
+        sentence = f"nothing has changed, {_looks(len(clear))}, {seen}{blind}"
         return "good" if silent < SILENT else "unsure", sentence, None
-    alike = len(list(takewhile(lambda look: look["changed"], reversed(telling))))
-    first = telling[-alike]["time"]
+    alike = len(list(takewhile(lambda one: one["changed"], reversed(clear))))
+    first = clear[-alike]["time"]
     if alike < CONFIRMED:
-        return "unsure", f"{last['sentence']}, seen once {ago(first, now)}: look again{blind}", first
-    old = (age := age_s(last["time"], now)) is not None and age > 86400.0 * OLD_DAYS
-    sentence = f"{last['sentence']}, since {for_long(first, now)}{f' ({seen})' if old else ''}{blind}"
-    return "bad", sentence, first
+        return "unsure", f"{last['sentence']}, seen once {_ago(first, now)}: look again{blind}", first
+    old = f" ({seen})" if age_s(last["time"], now) > OLD_S else ""
+    return "bad", f"{last['sentence']}, since {_for_long(first, now)}{old}{blind}", first
 
 
-def _age_of(look: str | None, now: datetime) -> float | None:
-    """How long ago a look was, seconds."""
-    age = None if look is None else age_s(look, now)
-    return None if age is None else max(age, 0.0)
-
-
-def findings(folder: Path, mast_digest: str, now: datetime | None = None) -> SentinelTold:
+def findings(folder: Path, mast_digest: str) -> SentinelTold:
     """Return what a folder says, as ``GET /sentinel`` has it; ``mast_digest``: of the mast file in use."""
-    reference, looks, wrong = read_folder(folder)
-    if reference is None:
-        return {
-            "level": "unsure" if wrong else "none",
-            "sentence": wrong or "no reference pictures have been taken",
-            "looks": 0, "since": None, "last_look": None, "age_s": None, "reference": None,
-        }  # fmt: skip
-    found = standing(reference, looks, now or datetime.now(UTC))
-    if reference.mast_digest != mast_digest:
-        sentence = f"the reference is of another mast file: take a new one ({found['sentence']})"
-        found |= {"level": "unsure", "sentence": sentence}
-    return found
-
-
-def read_folder(folder: Path) -> tuple[Reference | None, list[dict[str, Any]], str]:
-    """Return a folder's reference and looks, and what is wrong with them; (None, [], '') without any."""
-    if not (folder / REFERENCE).is_file():
-        return None, [], ""
+    damaged = ""
     try:
-        reference = read_reference(folder)
-        return reference, read_looks(folder, reference), ""
+        if (folder / REFERENCE).is_file():
+            reference = read_reference(folder)
+            found = standing(reference, read_looks(folder, reference))
+            if reference.mast_digest != mast_digest:
+                sentence = f"the reference is of another mast file: take a new one ({found['sentence']})"
+                found |= {"level": "unsure", "sentence": sentence}
+            return found
     except BadFile as error:
-        return None, [], str(error)
+        damaged = str(error)
+    return {
+        "level": "unsure" if damaged else "none",
+        "sentence": damaged or "no reference pictures have been taken",
+        "looks": 0, "since": None, "last_look": None, "age_s": None, "reference": None,
+    }  # fmt: skip
 
 
 def _looks(count: int) -> str:
     return f"{count} look" + "s" * (count != 1)
 
 
-def age_s(time: str, now: datetime) -> float | None:
-    """Return how long ago a time (ISO 8601) was, seconds; less than 0: it is to come; None: it is none."""
-    try:
-        return (now - datetime.fromisoformat(time).astimezone(UTC)).total_seconds()
-    except (ValueError, TypeError, OverflowError):
-        return None
+def age_s(time: str, now: datetime) -> float:
+    """Return how long ago a time (ISO 8601) was, seconds; less than 0: it is to come."""
+    return (now - datetime.fromisoformat(time).astimezone(UTC)).total_seconds()
 
 
-def for_long(time: str, now: datetime) -> str:
-    """Return how long ago that was, as ``3 days``."""
+def _for_long(time: str, now: datetime) -> str:
+    """How long ago that was, as ``3 days``."""
     age = age_s(time, now)
-    if age is None:
-        return "an unknown time"
     hours = abs(age) / 3600.0
     if hours < 1.0:
         text = f"{60.0 * hours:.0f} min"
@@ -326,11 +304,9 @@ def for_long(time: str, now: datetime) -> str:
     return text if age > -90.0 else f"a time {text} ahead of this clock"
 
 
-def ago(time: str, now: datetime) -> str:
-    """Return when that was, as ``3 days ago``."""
-    age = age_s(time, now)
-    text = for_long(time, now)
-    return f"at {text}" if age is None or age <= -90.0 else f"{text} ago"
+def _ago(time: str, now: datetime) -> str:
+    text = _for_long(time, now)
+    return f"at {text}" if text.startswith("a time") else f"{text} ago"
 
 
 RENEWED_S = 60.0
@@ -344,39 +320,30 @@ class SentinelFindings:
         self._folder = folder
         self._mast_digest = mast_digest
         self._found: SentinelTold | None = None
-        self._level = "none"
         self._read: object = None
         thread.poll(self._poll)
 
     def summary(self) -> SentinelTold | None:
         """Return the answer of ``GET /sentinel``, None before the folder was read for the first time."""
         found = self._found
-        return found and {**found, "age_s": _age_of(found["last_look"], datetime.now(UTC))}
+        if found is None or found["last_look"] is None:
+            return found
+        return {**found, "age_s": max(age_s(found["last_look"], datetime.now(UTC)), 0.0)}
 
     # In the journals' thread
 
     def _poll(self) -> None:
-        mark = self._mark(), self._mast_digest(), datetime.now(UTC).timestamp() // RENEWED_S
-        if mark != self._read:
-            self._read = mark
-            self._publish(findings(self._folder, mark[1]))
-
-    def _mark(self) -> tuple[tuple[int, int] | None, ...]:
-        """What changes whenever one of the files does."""
-        marks: list[tuple[int, int] | None] = []
+        """Read the folder anew whenever a file, the mast file or the minute is another; log changes."""
+        marks = []
         for name in (REFERENCE, LOOKS):
-            try:
+            with suppress(OSError):
                 about = (self._folder / name).stat()
-            except OSError:
-                marks.append(None)
-            else:
-                marks.append((about.st_mtime_ns, about.st_size))
-        return tuple(marks)
-
-    def _publish(self, found: SentinelTold) -> None:
-        """Publish findings; a change that comes or goes is logged."""
-        before, self._level, self._found = self._level, found["level"], found
-        if self._level == "bad" and before != "bad":
-            log.warning("drift sentinel: %s", found["sentence"])
-        elif before == "bad" and self._level != "bad":
-            log.info("drift sentinel: %s", found["sentence"])
+                marks.append((name, about.st_mtime_ns, about.st_size))
+        read = marks, self._mast_digest(), datetime.now(UTC).timestamp() // RENEWED_S
+        if read == self._read:
+            return
+        self._read = read
+        before, self._found = self._found, findings(self._folder, read[1])
+        bad, was_bad = self._found["level"] == "bad", before is not None and before["level"] == "bad"
+        if bad != was_bad:
+            log.log(logging.WARNING if bad else logging.INFO, "drift sentinel: %s", self._found["sentence"])

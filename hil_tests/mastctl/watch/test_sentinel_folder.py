@@ -70,7 +70,7 @@ def test_a_reference_comes_back_as_it_was_saved(tmp_path: Path) -> None:
 
 def test_a_new_reference_takes_the_place_of_the_old_one_and_its_looks(tmp_path: Path) -> None:
     first = save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
-    add_look(tmp_path, first, NOW.isoformat(), SceneDrift(2))
+    add_look(tmp_path, first, SceneDrift(2))
     looks = (tmp_path / LOOKS).read_bytes()
     second = save_reference(tmp_path, "2026-05-02T00:00:00+00:00", RESTS[:1], pictures()[:1])
     assert read_looks(tmp_path, second) == []
@@ -83,10 +83,10 @@ def test_a_new_reference_takes_the_place_of_the_old_one_and_its_looks(tmp_path: 
 def test_looks_are_added_line_by_line_and_a_torn_one_costs_only_itself(tmp_path: Path) -> None:
     reference = save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
     drift = SceneDrift(4, ("eye at rest 2",), 9.0, 3.0)
-    add_look(tmp_path, reference, NOW.isoformat(), drift)
+    add_look(tmp_path, reference, drift)
     with (tmp_path / LOOKS).open("a") as file:
         file.write('{"time": "2026-0')
-    add_look(tmp_path, reference, NOW.isoformat(), drift)
+    add_look(tmp_path, reference, drift)
     looks = read_looks(tmp_path, reference)
     assert len(looks) == 2
     assert looks[1]["changed"] is True
@@ -98,7 +98,7 @@ def test_a_disk_that_is_full_costs_the_new_reference_and_not_the_old(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = save_reference(tmp_path, "2026-05-01T00:00:00+00:00", RESTS, pictures())
-    add_look(tmp_path, first, NOW.isoformat(), SceneDrift(2))
+    add_look(tmp_path, first, SceneDrift(2))
 
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -115,7 +115,7 @@ def test_a_disk_that_is_full_costs_the_new_reference_and_not_the_old(
         assert len(list(tmp_path.glob("pictures-*"))) == 1
     monkeypatch.setattr("os.fdatasync", full)
     with pytest.raises(BadFile, match="No space left on device; the look is not kept"):
-        add_look(tmp_path, first, NOW.isoformat(), SceneDrift(2))
+        add_look(tmp_path, first, SceneDrift(2))
 
 
 @pytest.mark.parametrize(
