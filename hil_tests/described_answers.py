@@ -15,8 +15,7 @@ import pytest
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mastctl import daemon as daemon_module
-from mastctl.web.app import api
-from mastctl.web.described import description
+from mastctl.web.app import api, description
 
 
 class Described:

@@ -41,7 +41,7 @@ from mastctl.service.service import Service
 from mastctl.service.stopping import StopsHang
 from mastctl.service_manager import Heartbeat, ServiceManager
 from mastctl.web.app import create_app
-from mastctl.web.parts import Parts
+from mastctl.web.commands import Parts
 from mastctl.web.pictures import CameraFeeds
 
 log = logging.getLogger(__name__)

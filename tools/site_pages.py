@@ -22,8 +22,7 @@ from mastctl.conform.rig_checks import RIG
 from mastctl.control.machine import MEANINGS
 from mastctl.errors import MastctlError
 from mastctl.testing.drivers import test_camera, test_head
-from mastctl.web.app import api
-from mastctl.web.described import description
+from mastctl.web.app import api, description
 from tools import notebooks
 from tools.page_tables import page_text
 

@@ -7,30 +7,32 @@ Every refusal is ``{"error": {"code", "message", "detail"}}``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine
+import threading
+from collections.abc import Callable, Coroutine, Mapping
 from functools import cache
 from importlib.metadata import version
-from typing import Any
+from typing import Annotated, Any
 
 from fastapi import FastAPI, Request, Response
+from fastapi.responses import JSONResponse
 from fastapi.routing import APIRoute
+from fastapi.utils import create_model_field
+from pydantic import Field, TypeAdapter
 from starlette.types import ASGIApp, Receive, Scope, Send
 from typing_extensions import get_type_hints, is_typeddict
 
-from mastctl.answers import ErrorBody
+from mastctl.answers import ErrorBody, Event, TrackTold
 from mastctl.http.guard import Guard
 from mastctl.http.refusals import JsonAnswer, add_errors
-from mastctl.web import described
+from mastctl.web.commands import REFERENCE, Here, Parts
 from mastctl.web.events import add_events
 from mastctl.web.images import add_cameras, add_images
 from mastctl.web.keeping import add_bench, add_masts, add_places, add_recordings
 from mastctl.web.page import add_page, add_site, text_answer
 from mastctl.web.panorama import add_panoramas, add_targets
-from mastctl.web.parts import Here, Parts
-from mastctl.web.sessions import add_sessions
 from mastctl.web.simulation import add_simulation
 from mastctl.web.steering import add_estop, add_lease, add_limits, add_pointing, add_tracking
-from mastctl.web.watching import add_watching
+from mastctl.web.watching import add_sessions, add_watching
 
 
 def create_app(parts: Parts) -> ASGIApp:
@@ -98,13 +100,51 @@ def api() -> FastAPI:
         add(app)
 
     @app.get("/openapi.json", include_in_schema=False)
-    async def told(request: Request, here: Here) -> Response:
-        text = _description() if described.is_made() else await here.waiting.run(_description)
+    async def document(request: Request, here: Here) -> Response:
+        made = _made.cache_info().currsize > 0
+        text = description(app) if made else await here.waiting.run(lambda: description(app))
         return text_answer(request.headers, text, "application/json")
 
     return app
 
 
-def _description() -> bytes:
-    """What /openapi.json tells; not for the event loop, which would let no stop through for 0.2 s."""
-    return described.description(api())
+_ONE_MAKES_IT = threading.Lock()
+
+
+def description(app: FastAPI) -> bytes:
+    """Return /openapi.json: FastAPI's description of the routes, with the types of their answers.
+
+    The first call takes 0.2 s, too long for the event loop, on which a stop would wait.
+    """
+    with _ONE_MAKES_IT:
+        return _made(app)
+
+
+@cache
+def _made(app: FastAPI) -> bytes:
+    for route in app.routes:
+        if isinstance(route, APIRoute) and route.include_in_schema:
+            kind: Any = get_type_hints(route.endpoint).get("return")
+            if is_typeddict(kind):
+                route.response_field = create_model_field(kind.__name__, kind, mode="serialization")
+                route.response_description = (kind.__doc__ or kind.__name__).strip().splitlines()[0]
+    document = app.openapi()
+    one = Field(discriminator="topic", title="Event", description="One event of ``/events``.")
+    streamed: dict[str, Any] = {"Event": Annotated[Event, one], "TrackTold": TrackTold}
+    for name, streams in streamed.items():
+        schema = TypeAdapter(streams).json_schema(mode="serialization", ref_template=REFERENCE)
+        document["components"]["schemas"] |= schema.pop("$defs", {}) | {name: schema}
+    _without_null(document)
+    return bytes(JSONResponse(document).body)
+
+
+def _without_null(document: Mapping[str, Any]) -> None:
+    """Describe headers and queries as present or absent: an address has no null."""
+    for methods in document["paths"].values():
+        for operation in methods.values():
+            for parameter in operation.get("parameters", ()):
+                schema = parameter["schema"]
+                kinds = [one for one in schema.get("anyOf", ()) if one.get("type") != "null"]
+                if len(kinds) == 1:
+                    del schema["anyOf"]
+                    schema.update(kinds[0])

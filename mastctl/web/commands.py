@@ -1,32 +1,70 @@
-"""How a request becomes a command: one way for all of them, and the other way round for a stop."""
+"""What every route is given, and how a request becomes a command: checks first, or the act first for a stop.
+
+The routes are made once a process, whatever many daemons it holds: a request brings its daemon's parts.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import inspect
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from inspect import Parameter
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, cast
 
 from fastapi import Depends, FastAPI, Header, Request
+from fastapi.requests import HTTPConnection
 from pydantic import BaseModel
 
 from mastctl.control.entry import Answer, Command, CommandRequest
 from mastctl.control.lease import Caller, client_name
 from mastctl.errors import Unable
 from mastctl.http import PREFIX
+from mastctl.http.guard import EntryRules
+from mastctl.http.waiting import Streams, Waiting
 from mastctl.motion.requests import DeadlineS
 from mastctl.service.service import Service
 from mastctl.service.stopping import StopsHang
-from mastctl.web.parts import Here, Parts
+from mastctl.web.pictures import CameraFeeds
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Callable[..., Mapping[str, Any]])
 
 STOP_ANSWER_S = 3.0  # the devices give a stop 1 s; beyond this the answer is that nothing is known
 NOTHING: Mapping[str, Any] = {}
+REFERENCE = "#/components/schemas/{model}"
+
+
+@dataclass(frozen=True)
+class Parts:
+    """What serves one daemon's requests, with the rules for its clients and the pictures for its viewers."""
+
+    service: Service
+    waiting: Waiting
+    streams: Streams
+    entrance: EntryRules
+    feeds: CameraFeeds
+
+
+async def _parts(line: HTTPConnection) -> Parts:
+    return cast(Parts, line.scope["state"]["parts"])
+
+
+Here = Annotated[Parts, Depends(_parts)]
+
+
+def stream_of(kind: str) -> dict[int | str, dict[str, Any]]:
+    """Describe a route of server-sent events: one line each, ``data:`` and JSON of a kind."""
+    event = {"$ref": REFERENCE.format(model=kind)}
+    stream = {"schema": {"type": "string"}, "x-endless": True, "x-event": event}
+    return {200: {"content": {"text/event-stream": stream}}}
+
+
+def file_of(*kinds: str, **others: Any) -> dict[int | str, dict[str, Any]]:
+    """Describe a route whose answer is a file of one of these media types."""
+    form = {"type": "string", "format": "binary"}
+    return {200: {"content": {kind: {"schema": form} for kind in kinds}, **others}}
 
 
 async def _requested(
@@ -56,7 +94,6 @@ def command(
     app: FastAPI,
     route: str,
     kind: Command,
-    summary: str,
     *,
     usual_s: Callable[..., float] | None = None,
     recorded: Callable[..., Mapping[str, Any]] | None = None,
@@ -66,15 +103,16 @@ def command(
     """Add the route of a command, whose function carries it out, in a worker thread, once the entry lets it.
 
     ``route`` is method and path below the prefix, ``POST /point``. The function takes the path, the query and
-    the body, and ``here`` and ``requested`` (`Requested`) if it needs them. ``usual_s``, of ``here`` and the
-    function's parameters, is an operation's time without a deadline. ``recorded``, of the function's
-    parameters, is what the command is recorded and recognised by; by default path, query and body.
+    the body, and ``here`` and ``requested`` (`Requested`) if it needs them; its docstring is the route's
+    summary. ``usual_s``, of ``here`` and the function's parameters, is an operation's time without a
+    deadline. ``recorded``, of the function's parameters, is what the command is recorded and recognised by,
+    by default path, query and body.
     ``beside``: it stops something, so it runs in the stops' own threads, and each try is carried out.
     """
     method, _, path = route.partition(" ")
 
     def add(act: F) -> F:
-        wanted = inspect.signature(act, eval_str=True)
+        wanted, summary = inspect.signature(act, eval_str=True), (inspect.getdoc(act) or "").rstrip(".")
 
         async def endpoint(
             request: Request, here: Parts, requested: CommandRequest, **given: Any

@@ -25,9 +25,8 @@ from mastctl.control.publisher import LoopSubscription, Published, Topic
 from mastctl.http import PREFIX
 from mastctl.http.refusals import query_of
 from mastctl.service.service import Service
-from mastctl.web.described import stream_of
+from mastctl.web.commands import Here, Parts, stream_of
 from mastctl.web.models import EventsQuery
-from mastctl.web.parts import Here, Parts
 
 EVENTS = f"{PREFIX}/events"
 ALIVE_S = 2.0  # between signs of life where nothing changes

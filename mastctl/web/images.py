@@ -26,11 +26,9 @@ from mastctl.frame_facts import described_headers, headers_of
 from mastctl.http import PREFIX
 from mastctl.http.refusals import query_of
 from mastctl.report.pictures import encoded
-from mastctl.web.commands import command
-from mastctl.web.described import file_of
+from mastctl.web.commands import Here, Parts, command, file_of
 from mastctl.web.events import UNSUPPORTED, close_ended, credential_of
 from mastctl.web.models import CameraSettingsBody, ImagesQuery, SnapshotQuery
-from mastctl.web.parts import Here, Parts
 from mastctl.web.pictures import Picture, Viewer
 
 IMAGES = f"{PREFIX}/images"
@@ -81,13 +79,9 @@ def add_cameras(app: FastAPI) -> None:
         here.service.check_camera(camera)
         return await here.waiting.run(lambda: _settings(here, camera, []))
 
-    @command(
-        app,
-        "PATCH /cameras/{camera}/settings",
-        CAMERA_SETTINGS,
-        "Change some of a camera's settings, each with its automatic turned off",
-    )
+    @command(app, "PATCH /cameras/{camera}/settings", CAMERA_SETTINGS)
     def change(camera: str, body: CameraSettingsBody, here: Here) -> CameraSettingsTold:
+        """Change some of a camera's settings, each with its automatic turned off."""
         return _settings(here, camera, here.service.devices.settings.change(camera, body.wanted))
 
 

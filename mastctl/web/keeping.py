@@ -8,40 +8,14 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Path, Request
 from fastapi.responses import FileResponse, Response
 
-from mastctl.answers import (
-    BenchAnswer,
-    BenchRuns,
-    MastChange,
-    PlaceList,
-    RecorderState,
-    RecordingDeleted,
-    RecordingEnded,
-    Recordings,
-    ReloadResult,
-    ReportList,
-)
+from mastctl import answers
 from mastctl.as_json import readable
 from mastctl.bench.runs import NAME
-from mastctl.control.entry import (
-    BENCH,
-    BENCH_FORGET,
-    BENCH_LEAVE,
-    BENCH_STANDS,
-    MAST,
-    MAST_BACK,
-    PLACE_FORGET,
-    PLACE_KEEP,
-    RECORD_DELETE,
-    RECORD_START,
-    RECORD_STOP,
-    RELOAD,
-)
+from mastctl.control import entry
 from mastctl.http import PREFIX
 from mastctl.service.masts import MastInUse, Masts
-from mastctl.web.commands import Requested, command
-from mastctl.web.described import file_of
+from mastctl.web.commands import Here, Requested, command, file_of
 from mastctl.web.models import BenchBody, MastBody, PlaceBody, RecordBody
-from mastctl.web.parts import Here
 
 REPORT = (
     "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox; base-uri 'none'; "
@@ -84,24 +58,25 @@ def add_masts(app: FastAPI) -> None:
             headers={"Mastctl-Mast-Digest": in_use.stored.digest},
         )
 
-    @command(app, "POST /mast", MAST, "Use another mast file, or the former one, from now on")
-    def load_mast(body: MastBody, here: Here) -> MastChange:
+    @command(app, "POST /mast", entry.MAST)
+    def load_mast(body: MastBody, here: Here) -> answers.MastChange:
+        """Use another mast file, or the former one, from now on."""
         masts = here.service.masts
         return _mast_change(masts, masts.back() if body.file is None else masts.load(body.file))
 
-    @command(app, "POST /mast/back", MAST_BACK, "Go back to the former mast file")
-    def back(here: Here) -> MastChange:
+    @command(app, "POST /mast/back", entry.MAST_BACK)
+    def back(here: Here) -> answers.MastChange:
+        """Go back to the former mast file."""
         masts = here.service.masts
         return _mast_change(masts, masts.back())
 
-    @command(
-        app, "POST /reload", RELOAD, "Read the configuration again: all of it comes into use, or nothing"
-    )
-    def read_again(here: Here) -> ReloadResult:
+    @command(app, "POST /reload", entry.RELOAD)
+    def read_again(here: Here) -> answers.ReloadResult:
+        """Read the configuration again: all of it comes into use, or nothing."""
         return here.service.reload()
 
 
-def _mast_change(masts: Masts, mast: MastInUse) -> MastChange:
+def _mast_change(masts: Masts, mast: MastInUse) -> answers.MastChange:
     former = masts.former
     return {"mast": mast.as_json(), "former_mast": None if former is None else former.as_json()}
 
@@ -110,15 +85,17 @@ def add_places(app: FastAPI) -> None:
     """Places of the head by a name; who goes there asks `POST /point` for its angles."""
 
     @app.get(f"{PREFIX}/places", summary="The places of the head that are kept by a name")
-    async def places(here: Here) -> PlaceList:
+    async def places(here: Here) -> answers.PlaceList:
         return {"places": await here.waiting.run(here.service.places.all)}
 
-    @command(app, "POST /places/{name}", PLACE_KEEP, "Keep a place by a name")
-    def keep(name: PlaceName, body: PlaceBody, here: Here) -> PlaceList:
+    @command(app, "POST /places/{name}", entry.PLACE_KEEP)
+    def keep(name: PlaceName, body: PlaceBody, here: Here) -> answers.PlaceList:
+        """Keep a place by a name."""
         return {"places": here.service.places.keep(name, body.model_dump())}
 
-    @command(app, "DELETE /places/{name}", PLACE_FORGET, "Forget a place; a forgotten home is 0, 0 again")
-    def forget(name: PlaceName, here: Here) -> PlaceList:
+    @command(app, "DELETE /places/{name}", entry.PLACE_FORGET)
+    def forget(name: PlaceName, here: Here) -> answers.PlaceList:
+        """Forget a place; a forgotten home is 0, 0 again."""
         return {"places": here.service.places.forget(name)}
 
 
@@ -126,17 +103,17 @@ def add_recordings(app: FastAPI) -> None:
     """What is recorded, its files, and runs begun, ended and deleted."""
 
     @app.get(f"{PREFIX}/recordings", summary="Every recording, and what is recorded now")
-    async def recordings(here: Here) -> Recordings:
+    async def recordings(here: Here) -> answers.Recordings:
         return await here.waiting.run(here.service.recorder.listing)
 
-    @command(
-        app, "POST /recordings/start", RECORD_START, "Record until it is ended, or there is no room left"
-    )
-    def start(body: RecordBody, here: Here) -> RecorderState:
+    @command(app, "POST /recordings/start", entry.RECORD_START)
+    def start(body: RecordBody, here: Here) -> answers.RecorderState:
+        """Record until it is ended, or there is no room left."""
         return here.service.recorder.start_run(body.name)
 
-    @command(app, "POST /recordings/stop", RECORD_STOP, "End the recording that was begun")
-    def stop(here: Here) -> RecordingEnded:
+    @command(app, "POST /recordings/stop", entry.RECORD_STOP)
+    def stop(here: Here) -> answers.RecordingEnded:
+        """End the recording that was begun."""
         return here.service.recorder.stop_run()
 
     @app.get(
@@ -151,8 +128,9 @@ def add_recordings(app: FastAPI) -> None:
         request.scope["headers"] = [one for one in headers if one[0] != b"range"]  # it is given whole
         return FileResponse(path, media_type="application/octet-stream", filename=readable(path.name))
 
-    @command(app, "DELETE /recordings/{name}", RECORD_DELETE, "Delete a run, or what was kept at a fault")
-    def delete(name: str, here: Here) -> RecordingDeleted:
+    @command(app, "DELETE /recordings/{name}", entry.RECORD_DELETE)
+    def delete(name: str, here: Here) -> answers.RecordingDeleted:
+        """Delete a run, or what was kept at a fault."""
         return here.service.recorder.delete(name)
 
 
@@ -160,42 +138,32 @@ def add_bench(app: FastAPI) -> None:
     """A bench calibration begun, answered, ended; reports."""
 
     @app.get(f"{PREFIX}/bench", summary="The bench calibration at work, and those that are kept")
-    async def bench(here: Here) -> BenchRuns:
+    async def bench(here: Here) -> answers.BenchRuns:
         return await here.waiting.run(here.service.bench.answer)
 
-    @command(
-        app,
-        "POST /bench",
-        BENCH,
-        "Begin a bench calibration, or go on with one",
-        status_code=202,
-        recorded=lambda body, **_: _without_file(body),
-    )
-    def begin(body: BenchBody, here: Here, requested: Requested) -> BenchAnswer:
+    @command(app, "POST /bench", entry.BENCH, status_code=202, recorded=lambda body, **_: _without_file(body))
+    def begin(body: BenchBody, here: Here, requested: Requested) -> answers.BenchAnswer:
+        """Begin a bench calibration, or go on with one."""
         bench = here.service.bench
         return {"run": bench.start(requested.caller.name, requested.last_stop, **body.model_dump())}
 
-    @command(app, "POST /bench/stands", BENCH_STANDS, "Confirm that the board stands where it is requested")
-    def stands(here: Here) -> BenchAnswer:
+    @command(app, "POST /bench/stands", entry.BENCH_STANDS)
+    def stands(here: Here) -> answers.BenchAnswer:
+        """Confirm that the board stands where it is requested."""
         return {"run": here.service.bench.stands()}
 
-    @command(
-        app, "POST /bench/leave", BENCH_LEAVE, "End the bench calibration; it can go on later", beside=True
-    )
-    def leave(here: Here, requested: Requested) -> BenchAnswer:
+    @command(app, "POST /bench/leave", entry.BENCH_LEAVE, beside=True)
+    def leave(here: Here, requested: Requested) -> answers.BenchAnswer:
+        """End the bench calibration; it can go on later."""
         return {"run": here.service.bench.leave(requested.caller.name)}
 
-    @command(
-        app,
-        "DELETE /bench/runs/{name}",
-        BENCH_FORGET,
-        "Remove a bench calibration that is over, pictures and report",
-    )
-    def forget(name: RunName, here: Here) -> BenchRuns:
+    @command(app, "DELETE /bench/runs/{name}", entry.BENCH_FORGET)
+    def forget(name: RunName, here: Here) -> answers.BenchRuns:
+        """Remove a bench calibration that is over, pictures and report."""
         return here.service.bench.forget(name)
 
     @app.get(f"{PREFIX}/reports", summary="The reports that can be read")
-    async def listed(here: Here) -> ReportList:
+    async def listed(here: Here) -> answers.ReportList:
         runs = here.service.bench.runs
         return {"reports": await here.waiting.run(runs.reports), "folder": str(runs.reports_folder)}
 

@@ -327,20 +327,22 @@ class FaultBody(StrictBody):
         return self
 
 
-class SnapshotQuery(BaseModel):
-    """``GET /snapshot/{camera}``; ``frame_id`` asks for a frame that is still kept."""
+class Query(BaseModel):
+    """A query without unknown names; not strict, since its values are text."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class SnapshotQuery(Query):
+    """``GET /snapshot/{camera}``; ``frame_id`` asks for a frame that is still kept."""
 
     format: Literal["png", "jpeg"] = "png"
     fresh: bool = False
     frame_id: Name | None = None
 
 
-class EventsQuery(BaseModel):
+class EventsQuery(Query):
     """``GET /events``: ``topics`` with commas between, all of them when left out; ``key``: of these only."""
-
-    model_config = ConfigDict(extra="forbid")
 
     topics: Annotated[str, Field(max_length=200)] | None = None
     key: Annotated[list[Name], Field(max_length=MOST_KEYS)] | None = None
@@ -364,26 +366,22 @@ class EventsQuery(BaseModel):
         return None if self.key is None else frozenset(self.key)
 
 
-class ImagesQuery(BaseModel):
+class ImagesQuery(Query):
     """``GET /images``, a WebSocket: of which cameras; whether their first pictures are requested too, and all
     of them come at the cameras' own rate.
     """
-
-    model_config = ConfigDict(extra="forbid")
 
     camera: Annotated[list[Name], Field(min_length=1, max_length=MOST_KEYS)]
     on_request: bool = False
     every: bool = False
 
 
-QueryPixel = Annotated[float, Field(ge=-LARGEST_PX, le=LARGEST_PX)]  # not strict: a query is text
+QueryPixel = Annotated[float, Field(ge=-LARGEST_PX, le=LARGEST_PX)]
 QueryMetres = Annotated[float, Field(ge=-LARGEST_M, le=LARGEST_M)]
 
 
-class TruthQuery(BaseModel):
+class TruthQuery(Query):
     """``GET /simulation/truth``: a frame, and a pixel of it or a point of the site, metres."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
     frame_id: Name
     x_px: QueryPixel | None = None
@@ -412,9 +410,7 @@ class TruthQuery(BaseModel):
         return self.x_m, self.y_m, self.z_m
 
 
-class FaultsQuery(BaseModel):
+class FaultsQuery(Query):
     """``DELETE /simulation/faults``; without a device all faults are taken back."""
-
-    model_config = ConfigDict(extra="forbid")
 
     device: Name | None = None

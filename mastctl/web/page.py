@@ -31,7 +31,7 @@ from mastctl.errors import NotKnown
 from mastctl.http import PREFIX
 from mastctl.packaged import site_folder
 from mastctl.service.service import Service
-from mastctl.web.parts import Here
+from mastctl.web.commands import Here
 
 ASK_AGAIN = "no-cache"
 """A browser keeps it, and checks each time whether it is still so."""

@@ -12,11 +12,9 @@ from mastctl.control.entry import PANORAMA, TARGET_FORGET, TARGET_KEEP
 from mastctl.http import PREFIX
 from mastctl.panorama.folder import Index
 from mastctl.service.steering import usual_s
-from mastctl.web.commands import command
-from mastctl.web.described import file_of
+from mastctl.web.commands import Here, command, file_of
 from mastctl.web.keeping import PlaceName
 from mastctl.web.models import PanoramaBody, TargetBody
-from mastctl.web.parts import Here
 
 Panorama = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]{0,60}$", description="a panorama's id")]
 WAY_S = 60.0
@@ -30,11 +28,11 @@ def add_panoramas(app: FastAPI) -> None:
         app,
         "POST /panoramas",
         PANORAMA,
-        "Take a panorama, or what an earlier one lacks",
         status_code=202,
         usual_s=lambda here, body: 400 * WAY_S + usual_s(here.service.config.limits, 0),
     )
     def take(body: PanoramaBody, here: Here) -> Started:
+        """Take a panorama, or what an earlier one lacks."""
         return {"id": here.service.panoramas.begin(body, body.model_dump(exclude_none=True)).id}
 
     @app.get(f"{PREFIX}/panoramas", summary="Every panorama, the newest first")
@@ -85,10 +83,12 @@ def add_targets(app: FastAPI) -> None:
     async def targets(here: Here) -> TargetList:
         return {"targets": await here.waiting.run(here.service.targets.all)}
 
-    @command(app, "POST /targets/{name}", TARGET_KEEP, "Keep a target by a name")
+    @command(app, "POST /targets/{name}", TARGET_KEEP)
     def keep(name: PlaceName, body: TargetBody, here: Here) -> TargetList:
+        """Keep a target by a name."""
         return {"targets": here.service.keep_target(name, body.position_m, body.frame, body.covariance_m2)}
 
-    @command(app, "DELETE /targets/{name}", TARGET_FORGET, "Forget a target")
+    @command(app, "DELETE /targets/{name}", TARGET_FORGET)
     def forget(name: PlaceName, here: Here) -> TargetList:
+        """Forget a target."""
         return {"targets": here.service.targets.forget(name)}

@@ -14,33 +14,14 @@ from calib.targets.board_file import board_of, document_of
 from drivers.faults import BOUNDS, WHEN, FaultPanel, Word
 from drivers.faults import Fault as SetFault
 from drivers.simulation_clock import MAX, SimulationClock
-from mastctl.answers import (
-    BoardList,
-    BoardPose,
-    FaultParameter,
-    FaultSet,
-    FaultsSet,
-    FaultWord,
-    FaultWordList,
-    PointTruth,
-    SimulationTime,
-    TruePose,
-)
+from mastctl import answers
 from mastctl.as_json import as_json
-from mastctl.control.entry import (
-    SIMULATION_BOARD,
-    SIMULATION_BOARD_GONE,
-    SIMULATION_FAULT,
-    SIMULATION_FAULTS_OFF,
-    SIMULATION_POSE,
-    SIMULATION_TIME,
-)
+from mastctl.control import entry
 from mastctl.errors import BadRequest, NoLonger, NotKnown, NotNow
 from mastctl.http import PREFIX
 from mastctl.service.service import Service
-from mastctl.web.commands import command
+from mastctl.web.commands import Here, command
 from mastctl.web.models import BoardBody, FaultBody, FaultsQuery, StandBody, TimeBody, TruthQuery
-from mastctl.web.parts import Here
 
 if TYPE_CHECKING:
     from drivers.sim.bench_boards import BenchBoard
@@ -59,21 +40,23 @@ def add_simulation(app: FastAPI) -> None:
     """The fault switches of a simulated rover, and where it truly stands."""
 
     @app.get(f"{PREFIX}/simulation/pose", summary="Where the simulated rover truly stands")
-    async def true_pose(here: Here) -> TruePose:
+    async def true_pose(here: Here) -> answers.TruePose:
         return await here.waiting.run(lambda: _pose(_rover(here.service, "true poses").site_from_rover))
 
-    @command(app, "POST /simulation/pose", SIMULATION_POSE, "Put the simulated rover somewhere on its ground")
-    def stand(body: StandBody, here: Here) -> TruePose:
+    @command(app, "POST /simulation/pose", entry.SIMULATION_POSE)
+    def stand(body: StandBody, here: Here) -> answers.TruePose:
+        """Put the simulated rover somewhere on its ground."""
         rover = _rover(here.service, "true poses")
         rover.stand(body.x_m, body.y_m, body.heading_rad, body.pitch_rad, body.roll_rad)
         return _pose(rover.site_from_rover)
 
     @app.get(f"{PREFIX}/simulation/boards", summary="The boards held up before the simulated rover")
-    async def boards(here: Here) -> BoardList:
+    async def boards(here: Here) -> answers.BoardList:
         return await here.waiting.run(lambda: _boards(_rover(here.service, "boards")))
 
-    @command(app, "POST /simulation/boards/{name}", SIMULATION_BOARD, "Hold up a board, or move it")
-    def put_board(name: BoardName, body: BoardBody, here: Here) -> BoardPose:
+    @command(app, "POST /simulation/boards/{name}", entry.SIMULATION_BOARD)
+    def put_board(name: BoardName, body: BoardBody, here: Here) -> answers.BoardPose:
+        """Hold up a board, or move it."""
         rover = _rover(here.service, "boards")
         printed = None
         if body.board is not None:
@@ -92,23 +75,20 @@ def add_simulation(app: FastAPI) -> None:
         )
         return _board(rover, stands)
 
-    @command(
-        app,
-        "DELETE /simulation/boards/{name}",
-        SIMULATION_BOARD_GONE,
-        "Take a board away from the simulated rover",
-    )
-    def take_board(name: BoardName, here: Here) -> BoardList:
+    @command(app, "DELETE /simulation/boards/{name}", entry.SIMULATION_BOARD_GONE)
+    def take_board(name: BoardName, here: Here) -> answers.BoardList:
+        """Take a board away from the simulated rover."""
         rover = _rover(here.service, "boards")
         rover.take_board(name)
         return _boards(rover)
 
     @app.get(f"{PREFIX}/simulation/time", summary="The simulated rover's time, and how fast it goes")
-    async def time(here: Here) -> SimulationTime:
+    async def time(here: Here) -> answers.SimulationTime:
         return await here.waiting.run(lambda: _time(here.service))
 
-    @command(app, "POST /simulation/time", SIMULATION_TIME, "Let time pass where it does not pass by itself")
-    def advance(body: TimeBody, here: Here) -> SimulationTime:
+    @command(app, "POST /simulation/time", entry.SIMULATION_TIME)
+    def advance(body: TimeBody, here: Here) -> answers.SimulationTime:
+        """Let time pass where it does not pass by itself."""
         speed = _time(here.service)["speed"]
         if speed != MAX:
             message = f"at simulation.speed {speed:g} time passes by itself; it is let pass only at {MAX}"
@@ -120,30 +100,27 @@ def add_simulation(app: FastAPI) -> None:
         f"{PREFIX}/simulation/truth",
         summary="The true point at a pixel of a frame, or the true pixel of a point",
     )
-    async def truth(query: Annotated[TruthQuery, Query()], here: Here) -> PointTruth:
+    async def truth(query: Annotated[TruthQuery, Query()], here: Here) -> answers.PointTruth:
         return await here.waiting.run(lambda: _truth(here.service, query))
 
     @app.get(f"{PREFIX}/simulation/words", summary="The fault words of each device, with their parameters")
-    async def words(here: Here) -> FaultWordList:
+    async def words(here: Here) -> answers.FaultWordList:
         return await here.waiting.run(lambda: {"devices": _words(_panel(here.service))})
 
     @app.get(f"{PREFIX}/simulation/faults", summary="The faults that are switched on")
-    async def faults(here: Here) -> FaultsSet:
+    async def faults(here: Here) -> answers.FaultsSet:
         return await here.waiting.run(lambda: _faults(_panel(here.service)))
 
-    @command(app, "POST /simulation/faults", SIMULATION_FAULT, "Switch a fault on")
-    def set_fault(body: FaultBody, here: Here) -> FaultsSet:
+    @command(app, "POST /simulation/faults", entry.SIMULATION_FAULT)
+    def set_fault(body: FaultBody, here: Here) -> answers.FaultsSet:
+        """Switch a fault on."""
         panel = _panel(here.service)
         panel.set(body.device, body.word, **body.parameters)
         return _faults(panel)
 
-    @command(
-        app,
-        "DELETE /simulation/faults",
-        SIMULATION_FAULTS_OFF,
-        "Switch the faults of one device, or all, off",
-    )
-    def clear_faults(query: Annotated[FaultsQuery, Query()], here: Here) -> FaultsSet:
+    @command(app, "DELETE /simulation/faults", entry.SIMULATION_FAULTS_OFF)
+    def clear_faults(query: Annotated[FaultsQuery, Query()], here: Here) -> answers.FaultsSet:
+        """Switch the faults of one device, or all, off."""
         panel = _panel(here.service)
         panel.clear(query.device)
         return _faults(panel)
@@ -162,27 +139,27 @@ def _panel(service: Service) -> FaultPanel:
     return _rover(service, "faults").faults
 
 
-def _pose(frame: Rigid) -> TruePose:
+def _pose(frame: Rigid) -> answers.TruePose:
     return {"position_m": frame.translation_m.tolist(), "quaternion": quaternion_of(frame.rotation)}
 
 
-def _board(rover: RoverModel, one: BenchBoard) -> BoardPose:
+def _board(rover: RoverModel, one: BenchBoard) -> answers.BoardPose:
     rover_from_board = rover.site_from_rover.inverse @ one.site_from_board
     return {"board": document_of(one.board), "bow_m": list(one.bow_m), **_pose(rover_from_board)}
 
 
-def _boards(rover: RoverModel) -> BoardList:
+def _boards(rover: RoverModel) -> answers.BoardList:
     return {"boards": {name: _board(rover, one) for name, one in rover.boards.items()}}
 
 
-def _time(service: Service) -> SimulationTime:
+def _time(service: Service) -> answers.SimulationTime:
     _rover(service, "clocks")
     clock = service.clock
     speed = clock.speed if isinstance(clock, SimulationClock) else 1.0
     return {"now_s": clock.now_s(), "speed": "max" if speed == math.inf else speed}
 
 
-def _truth(service: Service, query: TruthQuery) -> PointTruth:
+def _truth(service: Service, query: TruthQuery) -> answers.PointTruth:
     """The truth requested. Raises NoLonger and as `frame_by_id`."""
     rover = _rover(service, "truths")
     frame = service.devices.frame_by_id(query.frame_id)
@@ -197,7 +174,7 @@ def _truth(service: Service, query: TruthQuery) -> PointTruth:
         raise NoLonger("frame_too_old", str(error.args[0])) from None
 
 
-def _truth_of(site_from_rover: Rigid, point_m: FloatArray | None, pixel_px: Any) -> PointTruth:
+def _truth_of(site_from_rover: Rigid, point_m: FloatArray | None, pixel_px: Any) -> answers.PointTruth:
     """A point of the rover frame and its pixel as JSON; without a point nothing is known."""
     if point_m is None:
         return {"position_in_site_m": None, "position_m": None, "pixel_px": None}
@@ -209,14 +186,14 @@ def _truth_of(site_from_rover: Rigid, point_m: FloatArray | None, pixel_px: Any)
     }
 
 
-def _words(panel: FaultPanel) -> dict[str, dict[str, FaultWord]]:
+def _words(panel: FaultPanel) -> dict[str, dict[str, answers.FaultWord]]:
     """The fault words of each device; what has no end is null."""
 
-    def parameter(name: str, usual: float) -> FaultParameter:
+    def parameter(name: str, usual: float) -> answers.FaultParameter:
         least, most = BOUNDS[name]
         return {"default": as_json(usual), "least": least, "most": as_json(most)}
 
-    def word(one: Word) -> FaultWord:
+    def word(one: Word) -> answers.FaultWord:
         parameters = {**one.parameters, **WHEN}
         return {
             "effect": one.does,
@@ -226,11 +203,11 @@ def _words(panel: FaultPanel) -> dict[str, dict[str, FaultWord]]:
     return {device: {name: word(one) for name, one in words.items()} for device, words in panel.words.items()}
 
 
-def _faults(panel: FaultPanel) -> FaultsSet:
+def _faults(panel: FaultPanel) -> answers.FaultsSet:
     return {"faults": [_fault(one) for one in panel.active()]}
 
 
-def _fault(fault: SetFault) -> FaultSet:
+def _fault(fault: SetFault) -> answers.FaultSet:
     """A set fault; one without an end has ``end_s`` null."""
     finite = {name: value for name, value in fault.parameters.items() if math.isfinite(value)}
-    return cast(FaultSet, as_json(fault) | {"parameters": finite})
+    return cast(answers.FaultSet, as_json(fault) | {"parameters": finite})

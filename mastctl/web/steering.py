@@ -11,41 +11,9 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 
-from mastctl.answers import (
-    EstopTold,
-    JogAnswer,
-    LeaseGranted,
-    LeaseTold,
-    Operations,
-    OperationTold,
-    PoseTaken,
-    Preview,
-    ResetTold,
-    Started,
-    Status,
-    StopTold,
-    SunTold,
-    TrackTold,
-)
-from mastctl.control.entry import (
-    ESTOP,
-    JOG,
-    LEASE,
-    LEASE_RELEASE,
-    LEASE_RENEW,
-    LEASE_TAKE,
-    OPERATION_STOP,
-    POINT,
-    POSE,
-    RESET,
-    STOP,
-    SUN,
-    SUN_FORGET,
-    TRACK,
-    TRACK_LOOK,
-    TRACK_STOP,
-    CommandRequest,
-)
+from mastctl import answers
+from mastctl.control import entry
+from mastctl.control.entry import CommandRequest
 from mastctl.control.lease import Lease, LeaseTable, client_name
 from mastctl.control.machine import Latched
 from mastctl.errors import BadRequest, NotNow, Unable, one_line
@@ -56,7 +24,7 @@ from mastctl.safety.latch import LONGEST
 from mastctl.service.service import Service
 from mastctl.service.steering import usual_s
 from mastctl.service.stopping import StopsHang
-from mastctl.web.commands import Requested, carried_out, command, stop_first
+from mastctl.web.commands import Here, Parts, Requested, carried_out, command, stop_first
 from mastctl.web.models import (
     EstopBody,
     LeaseBody,
@@ -66,7 +34,6 @@ from mastctl.web.models import (
     SunBody,
     TakeBody,
 )
-from mastctl.web.parts import Here, Parts
 
 BODY_S = 1.0  # what a stop that has been carried out waits for its reason
 LARGEST_BODY_BYTES = 4096
@@ -77,22 +44,22 @@ def add_pointing(app: FastAPI) -> None:
     """State, operations and the stop."""
 
     @app.get(f"{PREFIX}/status", summary="The present state of daemon, head, cameras and calibration")
-    async def status(here: Here) -> Status:
+    async def status(here: Here) -> answers.Status:
         return here.service.status()
 
     @command(
         app,
         "POST /point",
-        POINT,
-        "Point at a pixel, a position, or joint angles",
+        entry.POINT,
         status_code=202,
         usual_s=lambda here, body: usual_s(here.service.config.limits, body.captures),
     )
-    def point(body: PointRequest, here: Here) -> Started:
+    def point(body: PointRequest, here: Here) -> answers.Started:
+        """Point at a pixel, a position, or joint angles."""
         return {"id": here.service.steering.point(body, body.model_dump(exclude_none=True)).id}
 
     @app.post(f"{PREFIX}/point/preview", summary="The point at a pixel, before anything moves")
-    async def preview(body: PointRequest, here: Here) -> Preview:
+    async def preview(body: PointRequest, here: Here) -> answers.Preview:
         service = here.service
         if body.pixel is None and body.panorama is None:
             raise BadRequest(
@@ -102,7 +69,7 @@ def add_pointing(app: FastAPI) -> None:
         service.check_camera(camera)
         cancelled = threading.Event()
         try:
-            seen: Preview = await here.waiting.image(
+            seen: answers.Preview = await here.waiting.image(
                 camera, lambda: service.steering.preview(body, cancelled)
             )
         except PointingError as error:
@@ -113,11 +80,11 @@ def add_pointing(app: FastAPI) -> None:
         return seen
 
     @app.get(f"{PREFIX}/operations", summary="The newest operations, without their steps")
-    async def operations(here: Here) -> Operations:
-        return {"operations": [entry.listed() for entry in here.service.operations.all()]}
+    async def operations(here: Here) -> answers.Operations:
+        return {"operations": [one.listed() for one in here.service.operations.all()]}
 
     @app.get(f"{PREFIX}/operations/{{operation_id}}", summary="One operation's record")
-    async def operation(operation_id: str, here: Here) -> OperationTold:
+    async def operation(operation_id: str, here: Here) -> answers.OperationTold:
         return here.service.operations.get(operation_id).as_json()
 
     @app.post(
@@ -126,17 +93,17 @@ def add_pointing(app: FastAPI) -> None:
     )
     async def stop_one(
         operation_id: str, request: Request, here: Here, requested: Requested
-    ) -> OperationTold:
+    ) -> answers.OperationTold:
         def act() -> dict[str, Any]:  # no id: it begins nothing
             here.service.operations.stop_one(operation_id)
             return {}
 
-        await carried_out(here, request, OPERATION_STOP, requested, {}, act, beside=True)
+        await carried_out(here, request, entry.OPERATION_STOP, requested, {}, act, beside=True)
         return here.service.operations.get(operation_id).as_json()
 
     @app.post(f"{PREFIX}/stop", summary="Stop the mast and the running operation, at once")
-    async def stop(request: Request, here: Here) -> StopTold:
-        return await stop_first(here, STOP, request, here.service.stopping.stop_answer)
+    async def stop(request: Request, here: Here) -> answers.StopTold:
+        return await stop_first(here, entry.STOP, request, here.service.stopping.stop_answer)
 
 
 def add_estop(app: FastAPI) -> None:
@@ -147,7 +114,7 @@ def add_estop(app: FastAPI) -> None:
         summary="Stop the mast and let nothing move it until it is reset, across restarts too",
         openapi_extra={"requestBody": {"content": {"application/json": {"schema": ANY_BODY}}}},
     )
-    async def estop(request: Request, here: Here) -> EstopTold:
+    async def estop(request: Request, here: Here) -> answers.EstopTold:
         stopping = here.service.stopping
         reading = asyncio.ensure_future(_reason_and_name(request))
         await asyncio.wait([reading], timeout=0)  # one turn of the loop: what came with the request is read
@@ -163,14 +130,15 @@ def add_estop(app: FastAPI) -> None:
             return given
 
         try:
-            answer = await stop_first(here, ESTOP, request, stop, given, late if follows else None)
+            answer = await stop_first(here, entry.ESTOP, request, stop, given, late if follows else None)
         except StopsHang as error:
             await here.waiting.run(lambda: stopping.latch_estop(**given))
             raise Unable("stop_unconfirmed", f"the emergency stop is latched, but {error}") from None
         return answer if cause is None else {**answer, "reason": cause.reason, "name": cause.name}
 
-    @command(app, "POST /reset", RESET, "Release an emergency stop; nothing moves before the next command")
-    def reset(body: ResetBody, here: Here) -> ResetTold:
+    @command(app, "POST /reset", entry.RESET)
+    def reset(body: ResetBody, here: Here) -> answers.ResetTold:
+        """Release an emergency stop; nothing moves before the next command."""
         return here.service.stopping.reset(body.reason, body.name)
 
 
@@ -199,75 +167,61 @@ def add_tracking(app: FastAPI) -> None:
     def one_look_s(here: Parts, **_: Any) -> float:
         return usual_s(here.service.config.limits, 1)
 
-    @command(
-        app,
-        "POST /pose",
-        POSE,
-        "Say where the rover stands; a track is carried over and looked for",
-        usual_s=one_look_s,
-    )
-    def pose(body: PoseBody, here: Here, requested: Requested) -> PoseTaken:
+    @command(app, "POST /pose", entry.POSE, usual_s=one_look_s)
+    def pose(body: PoseBody, here: Here, requested: Requested) -> answers.PoseTaken:
+        """Say where the rover stands; a track is carried over and looked for."""
         operation = here.service.steering.take_pose(body.pose(requested.came_s), body.look)
         stop_before_keep_outs(here.service)  # a sun of the site frame turns with the rover
         return {"operation": operation, "track": here.service.track_answer()}
 
     @app.get(f"{PREFIX}/track", summary="The track at this moment")
-    async def track(here: Here) -> TrackTold:
+    async def track(here: Here) -> answers.TrackTold:
         return here.service.track_answer()
 
-    @command(
-        app,
-        "POST /track",
-        TRACK,
-        "Follow what a pixel shows, or is at a position",
-        status_code=202,
-        usual_s=one_look_s,
-    )
-    def start(body: TrackRequest, here: Here) -> Started:
+    @command(app, "POST /track", entry.TRACK, status_code=202, usual_s=one_look_s)
+    def start(body: TrackRequest, here: Here) -> answers.Started:
+        """Follow what a pixel shows, or is at a position."""
         recorded = {"track": body.model_dump(exclude_none=True)}
         return {"id": here.service.steering.start_track(body, recorded).id}
 
-    @command(
-        app,
-        "POST /track/look",
-        TRACK_LOOK,
-        "Look for the target once more",
-        status_code=202,
-        usual_s=one_look_s,
-    )
-    def look(here: Here) -> Started:
+    @command(app, "POST /track/look", entry.TRACK_LOOK, status_code=202, usual_s=one_look_s)
+    def look(here: Here) -> answers.Started:
+        """Look for the target once more."""
         return {"id": here.service.steering.look().id}
 
     @app.post(f"{PREFIX}/track/stop", summary="End the track; the head stops if it moves for it")
-    async def stop(request: Request, here: Here, requested: Requested) -> TrackTold:
+    async def stop(request: Request, here: Here, requested: Requested) -> answers.TrackTold:
         def act() -> dict[str, Any]:  # no id: it begins nothing
             here.service.stopping.stop_track()
             return {}
 
-        await carried_out(here, request, TRACK_STOP, requested, {}, act, beside=True)
+        await carried_out(here, request, entry.TRACK_STOP, requested, {}, act, beside=True)
         return here.service.track_answer()
 
 
 def add_limits(app: FastAPI) -> None:
     """The jog, and the sun."""
 
-    @command(app, "POST /jog", JOG, "A heartbeat: turn the head at a rate, for half a second")
-    def jog(body: JogBeat, here: Here) -> JogAnswer:
+    @command(app, "POST /jog", entry.JOG)
+    def jog(body: JogBeat, here: Here) -> answers.JogAnswer:
+        """A heartbeat: turn the head at a rate, for half a second."""
         return here.service.jogs.beat(body)
 
     @app.get(f"{PREFIX}/limits/sun", summary="The direction that no head camera looks into")
-    async def sun(here: Here) -> SunTold:
+    async def sun(here: Here) -> answers.SunTold:
         return here.service.devices.judge.sun_as_json()
 
-    @command(app, "POST /limits/sun", SUN, "Say where the sun stands; the head keeps off it")
-    def tell(body: SunBody, here: Here, requested: Requested) -> SunTold:
+    @command(app, "POST /limits/sun", entry.SUN)
+    def tell(body: SunBody, here: Here, requested: Requested) -> answers.SunTold:
+        """Say where the sun stands; the head keeps off it."""
         judge = here.service.devices.judge
         judge.use_sun(body.sun(requested.came_s))
         stop_before_keep_outs(here.service)
         return judge.sun_as_json()
 
-    @command(app, "DELETE /limits/sun", SUN_FORGET, "Keep the head off no sun any more")
-    def forget(here: Here) -> SunTold:
+    @command(app, "DELETE /limits/sun", entry.SUN_FORGET)
+    def forget(here: Here) -> answers.SunTold:
+        """Keep the head off no sun any more."""
         judge = here.service.devices.judge
         judge.use_sun(None)
         return judge.sun_as_json()
@@ -284,44 +238,39 @@ def add_lease(app: FastAPI) -> None:
     """Who steers: acquired, renewed, released, taken over."""
 
     @app.get(f"{PREFIX}/lease", summary="Who steers")
-    async def control(here: Here) -> LeaseTold:
+    async def control(here: Here) -> answers.LeaseTold:
         return {"control": here.service.leases.as_json()}
 
-    @command(app, "POST /lease", LEASE, "Acquire the lease, if no other client steers")
-    def acquire(body: LeaseBody, here: Here, requested: Requested) -> LeaseGranted:
+    @command(app, "POST /lease", entry.LEASE)
+    def acquire(body: LeaseBody, here: Here, requested: Requested) -> answers.LeaseGranted:
+        """Acquire the lease, if no other client steers."""
         leases = here.service.leases
         return _granted(leases, leases.acquire(requested.caller, **_terms(body)))
 
     @command(
         app,
         "POST /lease/renew",
-        LEASE_RENEW,
-        "Have the lease run for its time from now on",
+        entry.LEASE_RENEW,
         recorded=lambda requested, body, **_: {
             "for_s": None if body is None else body.for_s,
             **_which(requested),
         },
     )
-    def renew(here: Here, requested: Requested, body: RenewBody | None = None) -> LeaseGranted:
+    def renew(here: Here, requested: Requested, body: RenewBody | None = None) -> answers.LeaseGranted:
+        """Have the lease run for its time from now on."""
         leases = here.service.leases
         return _granted(leases, leases.renew(_lease_of(requested), None if body is None else body.for_s))
 
-    @command(
-        app,
-        "DELETE /lease",
-        LEASE_RELEASE,
-        "Release the lease",
-        recorded=lambda requested, **_: _which(requested),
-    )
-    def release(here: Here, requested: Requested) -> LeaseTold:
+    @command(app, "DELETE /lease", entry.LEASE_RELEASE, recorded=lambda requested, **_: _which(requested))
+    def release(here: Here, requested: Requested) -> answers.LeaseTold:
+        """Release the lease."""
         leases = here.service.leases
         leases.release(_lease_of(requested))
         return {"control": leases.as_json()}
 
-    @command(
-        app, "POST /lease/take", LEASE_TAKE, "Take the lease from its holder; what runs under it is stopped"
-    )
-    def take(body: TakeBody, here: Here, requested: Requested) -> LeaseGranted:
+    @command(app, "POST /lease/take", entry.LEASE_TAKE)
+    def take(body: TakeBody, here: Here, requested: Requested) -> answers.LeaseGranted:
+        """Take the lease from its holder; what runs under it is stopped."""
         leases = here.service.leases
         return _granted(leases, leases.take(requested.caller, body.reason, **_terms(body)))
 
@@ -332,7 +281,7 @@ def _terms(body: LeaseBody) -> dict[str, Any]:
     return terms | {"name": None if body.name is None else client_name(body.name)}
 
 
-def _granted(leases: LeaseTable, lease: Lease) -> LeaseGranted:
+def _granted(leases: LeaseTable, lease: Lease) -> answers.LeaseGranted:
     return {"lease_id": lease.id, **leases.lease_as_json(lease)}
 
 

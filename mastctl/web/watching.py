@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from fastapi import FastAPI, Request, Response
 
-from mastctl.answers import CalibrationReport, LiveTold, ReadyTold, SentinelTold
+from mastctl import answers
 from mastctl.answers.kinds import WELL
+from mastctl.control.lease import Caller
 from mastctl.errors import Unable
 from mastctl.http import PREFIX
-from mastctl.http.guard import from_this_machine
+from mastctl.http.guard import cookie_name, from_this_machine, shown_token
 from mastctl.watch.metrics import CONTENT_TYPE
 from mastctl.watch.sentinel import SENTINEL_FOLDER, findings
-from mastctl.web.commands import caller_of
-from mastctl.web.described import file_of
-from mastctl.web.parts import Here
+from mastctl.web.commands import Here, caller_of, file_of
+
+COOKIE_S = 12 * 3600
 
 
 def add_watching(app: FastAPI) -> None:
@@ -30,7 +31,7 @@ def add_watching(app: FastAPI) -> None:
         return Response(text, media_type=CONTENT_TYPE)
 
     @app.get(f"{PREFIX}/health/live", summary="Whether requests are answered: they are")
-    async def live(request: Request, here: Here) -> LiveTold:
+    async def live(request: Request, here: Here) -> answers.LiveTold:
         access = here.entrance.access
         if access is None or not from_this_machine(request.scope, request.headers):
             return {"live": True}
@@ -40,7 +41,7 @@ def add_watching(app: FastAPI) -> None:
         f"{PREFIX}/health/ready",
         summary="Whether commands are carried out: 200 if they are, else 503 and why not",
     )
-    async def ready(request: Request, here: Here) -> ReadyTold:
+    async def ready(request: Request, here: Here) -> answers.ReadyTold:
         now = here.service.machine.standing
         reason = "" if caller_of(request).stranger else now.reason  # it may name a person
         if now.state not in WELL:
@@ -51,7 +52,7 @@ def add_watching(app: FastAPI) -> None:
         f"{PREFIX}/calibration/health",
         summary="Whether the mast file still holds, with the figures of the last days' residuals",
     )
-    async def calibration(here: Here) -> CalibrationReport:
+    async def calibration(here: Here) -> answers.CalibrationReport:
         service = here.service
         health = service.health
         return {
@@ -63,7 +64,41 @@ def add_watching(app: FastAPI) -> None:
         }
 
     @app.get(f"{PREFIX}/sentinel", summary="The findings of the drift sentinel, and the age of its last look")
-    async def sentinel(here: Here) -> SentinelTold:
+    async def sentinel(here: Here) -> answers.SentinelTold:
         service = here.service
         folder = service.folder.path / SENTINEL_FOLDER
         return await here.waiting.run(lambda: findings(folder, service.stored.digest))
+
+
+def add_sessions(app: FastAPI) -> None:
+    """The caller, and its cookie."""
+
+    @app.get(f"{PREFIX}/session", summary="The client's name and rights")
+    async def session(request: Request, here: Here) -> answers.ClientSession:
+        return _session(request, here)
+
+    @app.post(f"{PREFIX}/session", summary="Keep the token of this request in the page's cookie")
+    async def keep(request: Request, response: Response, here: Here) -> answers.ClientSession:
+        token, _ = shown_token(request.scope, request.headers)
+        if here.entrance.access is not None and token is not None:
+            response.set_cookie(
+                cookie_name(request.scope),
+                token,
+                max_age=COOKIE_S,
+                path="/",
+                secure=request.headers.get("origin", "").startswith("https:"),
+                httponly=True,
+                samesite="strict",
+            )
+        return _session(request, here)
+
+    @app.delete(f"{PREFIX}/session", summary="Forget the page's cookie")
+    async def forget(request: Request, response: Response, here: Here) -> answers.ClientSession:
+        response.delete_cookie(cookie_name(request.scope), path="/", httponly=True, samesite="strict")
+        return _session(request, here)
+
+
+def _session(request: Request, here: Here) -> answers.ClientSession:
+    caller: Caller = request.scope["state"]["caller"]
+    needs_token = here.entrance.access is not None
+    return {"name": caller.name, "role": caller.role, "via": caller.via, "needs_token": needs_token}
