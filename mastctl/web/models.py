@@ -327,13 +327,13 @@ class FaultBody(StrictBody):
         return self
 
 
-class Query(BaseModel):
-    """A query without unknown names; not strict, since its values are text."""
+class StrictQuery(BaseModel):
+    """A query without unknown names; its numbers come as text."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
-class SnapshotQuery(Query):
+class SnapshotQuery(StrictQuery):
     """``GET /snapshot/{camera}``; ``frame_id`` asks for a frame that is still kept."""
 
     format: Literal["png", "jpeg"] = "png"
@@ -341,7 +341,7 @@ class SnapshotQuery(Query):
     frame_id: Name | None = None
 
 
-class EventsQuery(Query):
+class EventsQuery(StrictQuery):
     """``GET /events``: ``topics`` with commas between, all of them when left out; ``key``: of these only."""
 
     topics: Annotated[str, Field(max_length=200)] | None = None
@@ -366,7 +366,7 @@ class EventsQuery(Query):
         return None if self.key is None else frozenset(self.key)
 
 
-class ImagesQuery(Query):
+class ImagesQuery(StrictQuery):
     """``GET /images``, a WebSocket: of which cameras; whether their first pictures are requested too, and all
     of them come at the cameras' own rate.
     """
@@ -380,7 +380,7 @@ QueryPixel = Annotated[float, Field(ge=-LARGEST_PX, le=LARGEST_PX)]
 QueryMetres = Annotated[float, Field(ge=-LARGEST_M, le=LARGEST_M)]
 
 
-class TruthQuery(Query):
+class TruthQuery(StrictQuery):
     """``GET /simulation/truth``: a frame, and a pixel of it or a point of the site, metres."""
 
     frame_id: Name
@@ -410,7 +410,7 @@ class TruthQuery(Query):
         return self.x_m, self.y_m, self.z_m
 
 
-class FaultsQuery(Query):
+class FaultsQuery(StrictQuery):
     """``DELETE /simulation/faults``; without a device all faults are taken back."""
 
     device: Name | None = None
