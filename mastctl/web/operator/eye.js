@@ -229,7 +229,7 @@ const clamp = (value, low, high) => Math.min(high, Math.max(low, value));
 /** Where a target should be: one sigma thrice enlarged, a cross, and its name if it has one. */
 const ellipse = (kind, { x_px: x, y_px: y, major_px: major, minor_px: minor, turn_rad: turn }, name = null) => s("g", {},
   s("ellipse", { class: kind, rx: Math.max(3 * major, 4), ry: Math.max(3 * minor, 4), transform: `translate(${x} ${y}) rotate(${(turn * 180) / Math.PI})` }),
-  cross(x, y, kind, 18), name === null ? null : s("text", { x: x + 14, y: y - 10 }, name));
+  cross(x, y, kind, 18), name === null ? null : s("text", { class: "named", x: x + 14, y: y - 10 }, name));
 
 export function cross(x, y, kind, size) {
   const gap = size / 4;

@@ -1,5 +1,5 @@
 // A panorama as a strip: taken, looked at closely, clicked; and the targets that are kept by a name.
-import { byId, h, keep, kept, put, s, say, set } from "./dom.js";
+import { byId, h, put, s, say, set } from "./dom.js";
 import { ask, fileOf, get, post } from "./api.js";
 import { camera as called, degrees, figure, inDegrees, number, sentence } from "./words.js";
 import { cross } from "./eye.js";
@@ -10,7 +10,6 @@ const CLOSEST = 6; // screen pixels to one of the mosaic
 const SHAKES_PX = 8; // of the screen: a hand that clicks moves by less
 const EDGE_PX = 24; // so far from the border the cross-hair stays when keys move it
 const TILT_DEG = [-40, 11]; // the daemon's own default
-const CHOSEN = "mastctl panorama";
 
 const clamp = (value, low, high) => Math.min(Math.max(value, low), Math.max(low, high));
 
@@ -37,7 +36,7 @@ class Strip {
   show(address, fine) {
     this.fine = fine;
     const image = this.image(address);
-    image.addEventListener("load", () => { for (const old of this.svg.querySelectorAll("image")) if (old !== image && old.getAttribute("href") !== fine) old.remove(); });
+    image.addEventListener("load", () => { while (image.previousElementSibling?.matches("image")) image.previousElementSibling.remove(); });
   }
 
   image(href) {
@@ -111,10 +110,6 @@ class Strip {
     return [(clientX - box.left - box.width / 2) / this.scale + this.middle[0], (clientY - box.top - box.height / 2) / this.scale + this.middle[1]].map((value) => Math.round(value * 100) / 100);
   }
 
-  holds([x, y]) {
-    return x >= -0.5 && y >= -0.5 && x <= this.width - 0.5 && y <= this.height - 0.5;
-  }
-
   point(pixel) {
     this.cursor = pixel;
     this.mark("cursor", pixel, "cursor");
@@ -156,7 +151,7 @@ class Strip {
     this.from = null;
     if (!from) return;
     const pixel = this.pixel(event.pointerType === "touch" ? event : from);
-    if (this.holds(pixel)) this.choose(pixel);
+    if ([this.width, this.height].every((side, k) => pixel[k] >= -0.5 && pixel[k] <= side - 0.5)) this.choose(pixel);
   }
 
   key(event) {
@@ -186,11 +181,11 @@ export class PanoramaPanel {
   constructor(events, target, tell) {
     Object.assign(this, { events, target, tell, all: [], targets: {} });
     this.strip = new Strip((pixel) => this.clicked(pixel));
-    this.choice = h("select", { "aria-label": "Panorama", onchange: () => { keep(CHOSEN, this.choice.value); this.look(); } });
+    this.choice = h("select", { "aria-label": "Panorama", onchange: () => { this.chosen = this.choice.value; this.look(); } });
     this.stands = h("p", { class: "quiet", id: "pano-state", role: "status" });
     this.more = h("button", { type: "button", hidden: true, onclick: () => this.take({ resume: this.one.id }) }, "Go on");
     this.seams = h("p", { id: "seams" });
-    this.view = h("div", { hidden: true }, this.strip.frame, h("div", { class: "pano-bar" }, this.strip.buttons, this.choice, this.more), this.stands, this.seams);
+    this.bar = h("div", { class: "pano-bar", hidden: true }, this.strip.buttons, this.choice, this.more);
     this.pair = h("select", { "aria-label": "Cameras" });
     this.angles = ["Pan from", "to", "Tilt from", "to"].map((words, k) => h("input", { inputmode: "decimal", autocomplete: "off", size: 5, "aria-label": `${k < 2 ? "Pan" : "Tilt"}, ${k % 2 ? "to" : "from"}, degrees`, id: `pano-${k}` }));
     this.go = h("button", { type: "submit", class: "go" }, "Take a panorama");
@@ -202,13 +197,13 @@ export class PanoramaPanel {
     this.keeper = h("form", { class: "angles", id: "keep-target", onsubmit: (event) => { event.preventDefault(); this.keepTarget(); } }, h("span", { class: "quiet" }), this.name, this.keeps);
     this.list = h("ul", { id: "kept-targets" });
     this.exports = h("p", { hidden: true }, "Save as ", [["CSV", "text/csv", csv], ["JSON", "application/json", features]].map(([words, type, text]) => h("a", { class: "save", href: "#", download: `targets.${words.toLowerCase()}`, onclick: ({ currentTarget }) => { currentTarget.href = URL.createObjectURL(new Blob([text(this.targets)], { type })); } }, words)).flatMap((one, k) => (k ? [", ", one] : [one])));
-    put(byId("panorama"), this.view, this.field, this.bad, h("h3", {}, "Targets kept by a name"), this.list, this.exports, this.keeper);
+    put(byId("panorama"), this.strip.frame, this.bar, this.stands, this.seams, this.field, this.bad, h("h3", {}, "Targets kept by a name"), this.list, this.exports, this.keeper);
     events.addEventListener("connected", () => this.look());
     events.addEventListener("command", ({ detail: { value } }) => { if (/^(target|panorama)/.test(value.command ?? "")) this.look(); });
     events.addEventListener("operation", ({ detail: { value } }) => { if (typeof value.request?.panorama === "string") this.look(); });
     events.addEventListener("joints", () => { this.turned = true; });
     document.addEventListener("target-changed", () => this.show());
-    setInterval(() => document.hidden || (this.one?.state === "running" ? this.look() : this.overlay()), POLL_MS);
+    setInterval(() => document.hidden || (this.taking() ? this.look() : this.overlay()), POLL_MS);
   }
 
   use({ limits }, { cameras }) {
@@ -238,16 +233,21 @@ export class PanoramaPanel {
   }
 
   begin() {
-    const degrees_ = this.angles.map((input) => figure(input.value || input.placeholder));
-    const wrong = this.angles.findIndex((_, k) => !Number.isFinite(degrees_[k]));
+    const typed = this.angles.map((input) => figure(input.value || input.placeholder));
+    const wrong = this.angles.findIndex((_, k) => !Number.isFinite(typed[k]));
     if (wrong >= 0) return say(this.bad, `'${this.angles[wrong].value}' where an angle in degrees is expected.`);
-    const [a, b, c, d] = degrees_.map((value) => (value * Math.PI) / 180);
+    const [a, b, c, d] = typed.map((value) => (value * Math.PI) / 180);
     return this.take({ [this.kind]: this.pair.value, pan_rad: [a, b], tilt_rad: [c, d] });
   }
 
   take(body) {
-    keep(CHOSEN, "");
+    this.chosen = body.resume;
     return this.act(() => post("/panoramas", body));
+  }
+
+  /** Whether what is shown is being taken; a daemon that was killed leaves one that only says so. */
+  taking({ state, id } = this.one ?? {}) {
+    return state === "running" && [...(this.events.known.get("operation")?.values() ?? [])].some((one) => one.request?.panorama === id && !one.ended_s);
   }
 
   /** What there is: the panoramas, the newest first, and the kept targets. One question at a time. */
@@ -256,17 +256,17 @@ export class PanoramaPanel {
     this.looking = true;
     try {
       [this.all, this.targets] = (await Promise.all([get("/panoramas"), get("/targets")])).map((one) => one.panoramas ?? one.targets);
-      this.one = this.all.find(({ id }) => id === kept(CHOSEN)) ?? this.all[0];
+      this.one = this.all.find(({ id }) => id === this.chosen) ?? this.all[0];
       this.drawing = this.drawing?.id === this.one?.id ? this.drawing : null;
       await this.picture();
       this.turned = true;
+      this.facing = ""; // targets may be others
       await this.overlay();
     } catch (error) {
       if (error.status && error.status !== 401) say(this.bad, error.message);
     }
     this.show();
-    this.looking = false;
-    if (this.again) { this.again = false; this.look(); }
+    setTimeout(() => { this.looking = false; if (this.again) { this.again = false; this.look(); } }, POLL_MS / 2);
   }
 
   /** The picture and what its seams say, where another view came or it was composed. */
@@ -290,12 +290,12 @@ export class PanoramaPanel {
     if (!one?.views.taken || !turned || !this.events.connected) return;
     this.turned = false;
     const facing = JSON.stringify(["pan_rad", "tilt_rad"].map((axis) => Math.round(2000 * (this.events.newest("joints", "pan_tilt")?.[axis] ?? 0))));
-    if (this.drawing && facing === this.facing && !this.looking) return;
+    if (this.drawing && facing === this.facing) return;
     this.facing = facing;
     const drawing = await get(`/panoramas/${one.id}/drawing`).catch(() => null);
     if (!drawing || one !== this.one) return;
     this.drawing = { ...drawing, id: one.id };
-    this.view.hidden = false;
+    this.strip.frame.hidden = false;
     this.strip.size(drawing.size_px);
     this.strip.put("view", drawing.view_px ? s("g", {}, ["halo", "head-view"].map((kind) => s("path", { class: kind, d: `M${drawing.view_px.map((one) => one.join(" ")).join("L")}Z` }))) : null);
     for (const name of Object.keys(this.strip.marks)) if (name.startsWith("target ") && !(name.slice(7) in drawing.targets_px)) this.strip.mark(name, null);
@@ -303,9 +303,10 @@ export class PanoramaPanel {
   }
 
   show() {
-    const { one, target, all } = this;
-    this.view.hidden = !one?.views.taken;
-    for (const part of [...this.angles, this.go, this.pair, this.more]) part.disabled = !this.may || one?.state === "running";
+    const { one, target, all } = this, taking = this.taking();
+    this.strip.frame.hidden = !one?.views.taken;
+    this.bar.hidden = !one;
+    for (const part of [...this.angles, this.go, this.pair, this.more]) part.disabled = !this.may || taking;
     const place = target.position();
     const clicked = target.click?.panorama;
     this.strip.mark("click", clicked && clicked.id === one?.id && target.state !== "none" ? clicked.pixel : null, "click");
@@ -316,7 +317,7 @@ export class PanoramaPanel {
     this.listed = drawn;
     this.exports.hidden = !Object.keys(this.targets).length;
     const ids = all.map(({ id, state }) => `${id} ${state}`).join();
-    if (ids !== this.ids) put(this.choice, all.map(({ id, time, camera, state }) => h("option", { value: id }, `${new Date(time).toLocaleString("en-GB", { dateStyle: "short", timeStyle: "short" })}, ${called(camera)}${state === "done" ? "" : `, ${state}`}`)));
+    if (ids !== this.ids) put(this.choice, all.map(({ id, time, camera, state }) => h("option", { value: id }, `${new Date(time).toLocaleString("en-GB", { dateStyle: "short", timeStyle: "short" })}, ${called(camera)}${state === "done" ? "" : ", not whole"}`)));
     this.ids = ids;
     if (!one) return;
     this.choice.value = one.id;
@@ -324,8 +325,9 @@ export class PanoramaPanel {
     const left = [missing && `${missing} missing`, forbidden && `${forbidden} left out: limits or keep-outs`].filter(Boolean).map((words) => `, ${words}`).join("");
     const count = `${taken} of ${taken + missing + wanted + forbidden} views${left}`;
     const running = taken && !wanted ? "composing the mosaic" : "STOP ends it, and what was taken is kept";
-    say(this.stands, { running: `Taking: ${count}; ${running}.`, done: `${count}. Click a point to see its range.`, ended: `Ended early: ${count}. ${sentence(inDegrees(one.reason))}` }[one.state]);
-    this.more.hidden = one.state === "running" || !(one.state === "ended" || missing);
+    if (taking) say(this.stands, `Taking: ${count}; ${running}.`);
+    else say(this.stands, one.state === "done" ? `${count}. Click a point to see its range.` : `Ended early: ${count}. ${sentence(inDegrees(one.reason || "the daemon ended meanwhile."))}`);
+    this.more.hidden = taking || (one.state === "done" && !missing);
   }
 
   clicked(pixel) {
