@@ -105,9 +105,7 @@ class AxisReport:
     measured_rad: float
     side: Side
     backlash_rad: float | None
-    current_A: float | None
     temperature_C: float | None
-    voltage_V: float | None
     count_rad: float | None = None
 
     @property

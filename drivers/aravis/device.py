@@ -7,8 +7,10 @@ import logging
 import math
 import threading
 import time
+from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +18,6 @@ from numpy.typing import NDArray
 
 from calib.geometry.mode import SensorMode
 from drivers.aravis import find
-from drivers.aravis.camera_clock import WallClock
 from drivers.aravis.library import CONTROL_LOST, GenicamError, library
 from drivers.aravis.settings import (
     EXPOSURE,
@@ -78,6 +79,32 @@ PACKET_SOCKET_DISABLED = 1
 """ARV_GV_STREAM_OPTION_PACKET_SOCKET_DISABLED. For a program that may have packet sockets (root) Aravis opens
 one per stream and filters it later. Until then it hears every camera of the network: in 8 of 360 openings
 beside another camera's stream it gave that camera's frame."""
+
+
+SET_S = 1e-3
+"""The wall's clock was set if it moved by more against CLOCK_MONOTONIC between two frames; time servers slew
+by 500 ppm at most."""
+
+
+LATEST_S = 1.0
+"""No frame waits longer in Aravis before it is taken."""
+
+
+@dataclass
+class WallClock:
+    """How long ago Aravis stamped a frame's first packet; it stamps by the wall's clock, which can be set."""
+
+    _offsets_s: deque[float] = field(default_factory=lambda: deque(maxlen=8))
+
+    def ago_s(self, stamped_s: float, wall_s: float, now_s: float) -> float:
+        """Return how long before ``now_s`` (CLOCK_MONOTONIC) it was, at most; both clocks were read at once.
+
+        0 where the wall's clock was set in the last eight frames: the frame came by now, no more is known.
+        """
+        offset_s = wall_s - now_s
+        same = bool(self._offsets_s) and all(abs(offset_s - was_s) <= SET_S for was_s in self._offsets_s)
+        self._offsets_s.append(offset_s)
+        return min(max(0.0, wall_s - stamped_s), LATEST_S) if same else 0.0
 
 
 class Device:

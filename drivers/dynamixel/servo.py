@@ -28,8 +28,8 @@ from drivers.dynamixel.registers import ControlItem, RegisterBlock
 from drivers.errors import BadReply, DriverError, HardwareFault, NoReply, Refused, WrongDevice
 from drivers.servo_bus.course import ServoSample
 from drivers.servo_bus.exchange import ATTEMPTS, LATE_S, again
+from drivers.servo_bus.pair import BusServo
 from drivers.servo_bus.port import QUIET_S, Part
-from drivers.servo_bus.servo import BusServo
 
 log = logging.getLogger(__name__)
 

@@ -106,18 +106,15 @@ def set_id(link: Link, old: int, new: int, new_baud: int | None = None, *, torqu
                 "--torque-off"
             )
         table.set("torque_enable", 0)
-    with changing(link, "dynamixel", old, new_baud) as change:
+    with changing(link, "dynamixel", old, new, new_baud):
         if old != new:
-            change.ids = [old, new]
             _change(link, old, model, "id", new)
             _confirm(link, new, model, f"servo {old} did not take the id {new}")
-            change.ids = [new]
-        if change.new_baud is not None:
-            change.bauds.append(change.new_baud)
-            _change(link, new, model, "baud", codes[change.new_baud])
+        if new_baud not in (None, link.baud):
+            _change(link, new, model, "baud", codes[new_baud])
             link.clock.sleep(0.05)  # the servo changes its rate after its answer
-            link.set_baud(change.new_baud)
-            _confirm(link, new, model, f"servo {new} does not answer at {change.new_baud} baud")
+            link.set_baud(new_baud)
+            _confirm(link, new, model, f"servo {new} does not answer at {new_baud} baud")
 
 
 def _change(link: Link, servo_id: int, model: ServoModel, register: str, value: int) -> None:

@@ -45,9 +45,8 @@ from drivers.servo_bus.bench import ServoBench
 from drivers.servo_bus.course import ServoSample
 from drivers.servo_bus.exchange import ATTEMPTS, again
 from drivers.servo_bus.head import BusHead
-from drivers.servo_bus.pair import ServoAxis, ServoPair, SessionWatch
+from drivers.servo_bus.pair import BusServo, ServoAxis, ServoPair, SessionWatch
 from drivers.servo_bus.port import Part
-from drivers.servo_bus.servo import BusServo
 from drivers.servo_bus.session import distrusted
 from drivers.servo_bus.settings import (
     HeadSettings,

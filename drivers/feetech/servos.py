@@ -452,18 +452,14 @@ def set_id(
             )
         link.write(old, registers["torque_enable"], 0)
     link.write(old, registers["lock"], UNLOCKED)
-    with changing(link, "feetech", old, new_baud) as change:
+    with changing(link, "feetech", old, new, new_baud):
         try:
             if old != new:
-                change.ids = [old, new]
                 link.write_unanswered(old, registers["id"], new)
-                if change.new_baud is not None:
-                    link.ping(new)  # before its rate changes
-                    change.ids = [new]
-            if change.new_baud is not None:
-                change.bauds.append(change.new_baud)
-                link.write_unanswered(new, registers["baud"], BAUD_RATES.index(change.new_baud))
-                link.set_baud(change.new_baud)
+            if new_baud not in (None, link.baud):
+                link.ping(new)  # before its rate changes
+                link.write_unanswered(new, registers["baud"], BAUD_RATES.index(new_baud))
+                link.set_baud(new_baud)
             link.write(new, registers["lock"], LOCKED)
         except BaseException:  # it has the one id or the other, and its EEPROM stays unlocked under neither
             for servo_id in {new, old}:

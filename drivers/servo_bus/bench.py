@@ -64,39 +64,18 @@ def check_change(link: BusLink, old: int, new: int, new_baud: int | None, rates:
         raise BadOptions(f"servo {old} already has this id and baud rate; there is nothing to do")
 
 
-@dataclass
-class Change:
-    """A change of a servo's id and rate that is under way."""
-
-    line: str
-    ids: list[int]
-    bauds: list[int]
-    new_baud: int | None
-
-    def sentence(self) -> str:
-        """Return what the servo is left with, and how to go on."""
-        ids, bauds = " or ".join(map(str, self.ids)), " or ".join(map(str, self.bauds))
-        scan = f"'mastctl rig servo scan {self.line} --baud {bauds.replace(' or', '')}' shows which"
-        left = f"the servo is left with the id {ids} at {bauds} baud: {scan}"
-        if self.new_baud is None:
-            return left
-        new, old = self.ids[-1], self.bauds[0]
-        command = f"mastctl rig servo set-id {self.line} {new} {new} --baud {old} --new-baud {self.new_baud}"
-        return f"{left}, and '{command}' gives the id {new} its rate"
-
-
 @contextmanager
-def changing(link: BusLink, family: str, old: int, new_baud: int | None) -> Iterator[Change]:
-    """Say, if a change is broken off within, what the servo is left with. Raises what broke it off."""
-    change = Change(
-        line_words(link.name, family), [old], [link.baud], None if new_baud == link.baud else new_baud
-    )
+def changing(link: BusLink, family: str, old: int, new: int, new_baud: int | None) -> Iterator[None]:
+    """Say, if a change of id and rate is broken off within, how the servo is found; raises what did it."""
+    before = link.baud
     try:
-        yield change
+        yield
     except BaseException as error:
-        if change.ids == [old] and len(change.bauds) == 1:
-            raise  # nothing was changed
-        message = f"{str(error) or 'interrupted'}; {change.sentence()}"
+        ids = f"{old}" if new == old else f"{old} or {new}"
+        bauds = f"{before}" if new_baud in (None, before) else f"{before} {new_baud}"
+        scan = f"'mastctl rig servo scan {line_words(link.name, family)} --baud {bauds}' shows which"
+        left = f"the servo is left with the id {ids} at {bauds.replace(' ', ' or ')} baud: {scan}"
+        message = f"{str(error) or 'interrupted'}; {left}"
         if isinstance(error, DriverError):
             raise type(error)(message, detail=error.detail) from error
         raise WrongDevice(message) from error

@@ -282,7 +282,6 @@ class AxisCourse:
         if sample is None:
             return None
         final = self._legs[-1] if self._legs else self.goal
-        unit = settings.model.current_unit_A
         return AxisReport(
             commanded_rad=self._commanded_rad,
             goal_counts=final,
@@ -291,9 +290,7 @@ class AxisCourse:
             measured_rad=settings.angle_rad(sample.counts),
             side=self._side,
             backlash_rad=settings.model.backlash_rad,
-            current_A=None if unit is None else sample.values["present_current"] * unit,
             temperature_C=sample.values["present_temperature"],
-            voltage_V=sample.values["present_voltage"] / 10,
             count_rad=settings.model.count_rad,
         )
 

@@ -14,8 +14,7 @@ from contextlib import suppress
 from drivers.clock import Clock
 from drivers.errors import BadReply, DriverError, LineLost, NoReply, WatchdogTripped
 from drivers.interfaces import Reading
-from drivers.servo_bus.pair import ServoAxis, ServoPair, SessionWatch
-from drivers.servo_bus.servo import Rest, rests
+from drivers.servo_bus.pair import Rest, ServoAxis, ServoPair, SessionWatch, rests
 from drivers.servo_bus.settings import HeadSettings
 
 log = logging.getLogger(__name__)

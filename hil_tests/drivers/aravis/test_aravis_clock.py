@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.aravis.camera_clock import DRIFT, CameraClock, ClockStepped, WallClock
+from drivers.aravis.camera import DRIFT, CameraClock, ClockStepped
+from drivers.aravis.device import WallClock
 
 AHEAD_S = 1000.0  # the camera's clock before ours
 ROUNDING_S = 1e-9

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from drivers.servo_bus.course import ServoSample
-from drivers.servo_bus.servo import Rest, come_to_rest, rests
+from drivers.servo_bus.pair import Rest, come_to_rest, rests
 from drivers.simulation_clock import SimulationClock
 
 START_S = 100.0

@@ -174,7 +174,7 @@ def test_the_record_names_every_step_in_order_with_plain_numbers() -> None:
 
 
 def test_the_record_has_the_counts_of_a_head_that_knows_them() -> None:
-    axis = AxisReport(0.1, 65, 0.0997, 64, 0.0982, "positive", None, None, None, None)
+    axis = AxisReport(0.1, 65, 0.0997, 64, 0.0982, "positive", None, None)
     _, steps = run(World(reports={"pan": axis}), PointRequest(pan_rad=0.1, tilt_rad=-0.4))
     assert steps[-1]["detail"]["counts"] == {
         "pan": {"goal_counts": 65, "measured_counts": 64, "left_rad": pytest.approx(-0.0018)}
