@@ -327,7 +327,7 @@ def save_rig(rig: Rig, path: str | Path) -> StoredRig:
             "axis_twist_rad": float(mast.axis_twist_rad),
         },
         "cameras": {
-            name: {"on": camera.on, **_model_keys(camera.model), **sensor_mode_keys(camera.sensor_mode)}
+            name: {"on": camera.on, **model_keys(camera.model), **sensor_mode_keys(camera.sensor_mode)}
             for name, camera in rig.cameras.items()
         },
         "stereo": rig.stereo,
@@ -350,7 +350,7 @@ def parse_camera(data: bytes, path: str | Path) -> CameraFile:
 
 def save_camera(camera: CameraFile, path: str | Path) -> CameraFile:
     """Save a camera file atomically and return what a reader will find. Raises BadFile as ``save_rig``."""
-    document: dict[str, Any] = {"schema": CAMERA_SCHEMA, "frame": camera.frame, **_model_keys(camera.model)}
+    document: dict[str, Any] = {"schema": CAMERA_SCHEMA, "frame": camera.frame, **model_keys(camera.model)}
     for key in ("fit", "provenance"):
         if getattr(camera, key):
             document[key] = getattr(camera, key)
@@ -397,7 +397,7 @@ def _opencv_model(
     return model, notes
 
 
-def _model_keys(model: CameraModel) -> dict[str, Any]:
+def model_keys(model: CameraModel) -> dict[str, Any]:
     """Return one camera model's keys in the order of docs/reference/configuration.md."""
     keys: dict[str, Any] = {"size_px": list(model.size_px), "model": model.kind}
     if model.kind in FREE:

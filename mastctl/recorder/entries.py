@@ -17,6 +17,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
 
+from calib.files.mast_file import model_keys
 from calib.files.twin import TwinError, nearest_opencv, twin_error
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig, RigCamera
@@ -202,7 +203,7 @@ def calibration(
 
     def record(near: dict[str, Any]) -> RecordedCamera:
         return {
-            "camera": name, "model": _model_record(model), "plumb_bob": near, "on": camera.on,
+            "camera": name, "model": as_json(model_keys(model)), "plumb_bob": near, "on": camera.on,
             "mast_digest": digest,
         }  # fmt: skip
 
@@ -275,16 +276,6 @@ def target_scene(position_m: Sequence[float], time_ns: int) -> Message:
     ball.size.x = ball.size.y = ball.size.z = TARGET_M
     ball.color.r, ball.color.g, ball.color.b, ball.color.a = TARGET_COLOUR
     return scene
-
-
-def _model_record(model: CameraModel) -> dict[str, Any]:
-    record: dict[str, Any] = {"model": model.kind, "size_px": list(model.size_px)}
-    record |= {letter: as_json(getattr(model, letter)) for letter in model.letters if letter != "D"}
-    if len(model.distortion):
-        record |= {key: as_json(getattr(model, key)) for key in ("distortion", "camera_matrix", "rotation")}
-    if model.kind == "CAHVORE":
-        record |= {"type": int(model.cahvore_type), "linearity": float(model.linearity)}
-    return record
 
 
 def _stamp(time_ns: int) -> Timestamp:

@@ -107,18 +107,9 @@ SPEED_RAD_PER_S, WHOLE_TURN_RAD = 1.0, 6.2832  # of a replay without the limits 
 class Recording:
     """A recording, read.
 
-    Attributes
-    ----------
-    found
-        What each of its files holds, and how it ended.
-    facts
-        The metadata at its start.
-    masts
-        Attached mast files by digest, the first one first.
-    operations
-        The last record of each operation, by id, oldest first.
-    frames
-        Frames by id.
+    ``found``: what each of its files holds, and how it ended; ``facts``: the metadata at its start;
+    ``masts``: attached mast files by digest, the first one first; ``operations``: the last record of each, by
+    id, oldest first; ``frames`` by id.
     """
 
     path: Path

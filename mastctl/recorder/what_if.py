@@ -44,17 +44,9 @@ LEAST_PX = 0.02
 class SeenAgain:
     """What a recorded pointing measured: all that is needed to work it out again.
 
-    Attributes
-    ----------
-    pair, pair_px, pair_sigma_px, pair_rad, pair_approach
-        The two cameras, (2, 2) pixels of the target in them, their sigma, and (pan, tilt) as read, with the
-        side from which each had come.
-    aim_camera, aim_px
-        Where the target was wanted.
-    commanded_rad, measured_rad, measured_approach
-        (pan, tilt) sent and reached, as the head reads them, and from which side.
-    target_px, target_sigma_px, frame_id
-        (2,) where the new picture showed the target.
+    ``pair_px``, (2, 2): pixels of the target in the ``pair`` at (pan, tilt) ``pair_rad``. The target was
+    wanted at ``aim_px``; (pan, tilt) was commanded and reached as the head reads it, from the side
+    ``measured_approach``; the new image showed the target at ``target_px``.
     """
 
     operation: str
@@ -306,11 +298,6 @@ class WhatIf:
     handoffs: Sequence[HandedAgain]
     others: Mapping[str, str]
 
-    @property
-    def answered(self) -> list[WouldBe]:
-        """The pointings that the other mast file has an answer for."""
-        return [one for one in self.pointings if one.residual_px is not None]
-
     def as_json(self) -> dict[str, Any]:
         """Return everything for programs."""
         name, stored = self.recording.first_mast
@@ -331,11 +318,12 @@ class WhatIf:
         were recorded, and as they would have been.
         """
         found: dict[str, tuple[list[FloatArray], list[FloatArray]]] = {}
-        for one in self.answered:
-            key = "first pointing" if one.seen.pointing == 1 else "second pointing"
-            was, would = found.setdefault(key, ([], []))
-            was.append(one.seen.residual_px)
-            would.append(np.asarray(one.residual_px))
+        for one in self.pointings:
+            if one.residual_px is not None:
+                key = "first pointing" if one.seen.pointing == 1 else "second pointing"
+                was, would = found.setdefault(key, ([], []))
+                was.append(one.seen.residual_px)
+                would.append(one.residual_px)
         for handed in self.handoffs:
             if handed.would_be_px is not None:
                 was, would = found.setdefault(f"hand-off to {handed.camera}", ([], []))

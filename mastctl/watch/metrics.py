@@ -35,9 +35,6 @@ STEP_S = (0.005, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 READING_S = (0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.2, 0.5, 1.0)
 ENDED = frozenset({"done", "failed", "stopped"})
 
-Errors = Callable[[], Mapping[tuple[str, str, str], int]]
-FrameCounts = Callable[[], Mapping[str, tuple[int, int]]]
-
 
 class Metrics:
     """The figures of one daemon, in a registry of their own.
@@ -49,13 +46,15 @@ class Metrics:
     def __init__(
         self,
         status: Callable[[], Status],
-        errors: Errors,
-        frame_counts: FrameCounts,
+        errors: Callable[[], Mapping[tuple[str, str, str], int]],
+        frame_counts: Callable[[], Mapping[str, tuple[int, int]]],
         publisher: Publisher,
         temperatures_c: Callable[[], Mapping[str, float]] = dict,
     ) -> None:
+        self._status, self._errors, self._frame_counts = status, errors, frame_counts
+        self._temperatures_c = temperatures_c
         self._registry = CollectorRegistry()
-        self._registry.register(_NowMetrics(status, errors, frame_counts, temperatures_c))
+        self._registry.register(self)
         ProcessCollector(registry=self._registry)
         self._operations = self._counter("operations", "Operations that have ended.", "state", "code")
         self._commands = self._counter("commands", "Commands, by what came of them.", "command", "result")
@@ -132,35 +131,21 @@ class Metrics:
         if "result" in record:  # not the record of its operation's end
             self._commands.labels(record["command"], record["result"]).inc()
 
-
-class _NowMetrics:
-    """The present state, read at each request."""
-
-    def __init__(
-        self,
-        status: Callable[[], Status],
-        errors: Errors,
-        frame_counts: FrameCounts,
-        temperatures_c: Callable[[], Mapping[str, float]],
-    ) -> None:
-        self._status = status
-        self._errors = errors
-        self._frame_counts = frame_counts
-        self._temperatures_c = temperatures_c
+    # For the library
 
     def describe(self) -> Iterable[Metric]:
         """Return nothing: without it the library would read a status to find the names."""
         return ()
 
     def collect(self) -> Iterable[Metric]:
-        """Yield the gauges."""
+        """Yield the present state."""
         status = self._status()
         mast, joints, control = status["mast"], status["joints"], status["control"]
         about = {"version": status["version"], "hardware": status["hardware"]}
         about |= {"mast_file": mast["file"], "mast_digest": mast["digest"]}
         yield InfoMetricFamily("mastctl", "The program and what it drives.", about)
-        states = StateSetMetricFamily("mastctl_state", "The state in one word.")
-        states.add_metric([], {word: word == status["state"] for word in get_args(Word)})
+        states = StateSetMetricFamily("mastctl_state", "The state of the daemon.")
+        states.add_metric([], {state: state == status["state"] for state in get_args(Word)})
         yield states
         yield _gauge("uptime_seconds", "Since the daemon started.", {(): status["uptime_s"]})
         if joints is not None:
@@ -173,23 +158,13 @@ class _NowMetrics:
         yield _gauge("frame_age_seconds", "Of the newest frame.", ages, "camera")
         faults = {(fault["device"], fault["code"]): 1.0 for fault in status["faults"]}
         yield _gauge("fault", "1 for each fault.", faults, "device", "code")
-        failed = CounterMetricFamily(
-            "mastctl_device_errors", "Calls to devices that failed.", labels=["device", "call", "code"]
-        )
-        for kind, count in self._errors().items():
-            failed.add_metric(kind, count)
-        yield failed
-        received = CounterMetricFamily(
-            "mastctl_frames_received", "Frames that a camera sent, requested or not.", labels=["camera"]
-        )
-        missed = CounterMetricFamily(
-            "mastctl_frames_missed", "Frames of a camera that were lost or damaged.", labels=["camera"]
-        )
-        for name, (good, lost) in self._frame_counts().items():
-            received.add_metric([name], good)
-            missed.add_metric([name], lost)
-        yield received
-        yield missed
+        failed = "Calls to devices that failed."
+        yield _count("device_errors", failed, self._errors(), "device", "call", "code")
+        counts = self._frame_counts()
+        received = {(name,): good for name, (good, _) in counts.items()}
+        yield _count("frames_received", "Frames that a camera sent, requested or not.", received, "camera")
+        missed = {(name,): lost for name, (_, lost) in counts.items()}
+        yield _count("frames_missed", "Frames of a camera that were lost or damaged.", missed, "camera")
         # The holder of a lease is no label, since clients choose their names.
         steers = {} if control is None else {(control["kind"],): 1.0}
         yield _gauge("lease", "1 for what steers: lease, operation.", steers, "kind")
@@ -213,4 +188,12 @@ def _gauge(name: str, summary: str, values: Mapping[Any, float | None], *labels:
     for each, value in values.items():
         if value is not None:
             family.add_metric(each, value)
+    return family
+
+
+def _count(name: str, summary: str, values: Mapping[Any, int], *labels: str) -> CounterMetricFamily:
+    """A counter with its values by labels."""
+    family = CounterMetricFamily(f"mastctl_{name}", summary, labels=labels)
+    for each, value in values.items():
+        family.add_metric(each, value)
     return family
