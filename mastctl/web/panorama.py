@@ -59,7 +59,7 @@ def add_panoramas(app: FastAPI) -> None:
 
     @app.get(
         f"{PREFIX}/panoramas/{{name}}/drawing",
-        summary="What is drawn over it: where the head looks now, targets",
+        summary="What is drawn over it: the camera's present view, targets",
     )
     async def drawing(name: Panorama, here: Here) -> PanoramaDrawn:
         return await here.waiting.run(lambda: here.service.panorama_drawn(name))

@@ -1,4 +1,4 @@
-// A panorama as a strip: taken, looked at closely, clicked; and the targets that are kept by a name.
+// A panorama as a strip: taken, seen closely, clicked; and the targets that are kept by a name.
 import { byId, h, put, s, say, set } from "./dom.js";
 import { ask, fileOf, get, post } from "./api.js";
 import { camera as called, degrees, figure, inDegrees, number, sentence } from "./words.js";
@@ -27,7 +27,7 @@ class Strip {
     }, this.svg, this.where);
     this.frame.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
     const zooms = [["+", "Zoom in", () => this.zoom(ZOOM)], ["−", "Zoom out", () => this.zoom(1 / ZOOM)], ["Whole", "Show the whole panorama", () => this.home()]];
-    this.buttons = zooms.map(([words, name, act]) => h("button", { type: "button", "aria-label": name, onclick: act }, words));
+    this.buttons = zooms.map(([text, name, act]) => h("button", { type: "button", "aria-label": name, onclick: act }, text));
     this.marks = {};
     new ResizeObserver(() => this.home(this.isHome)).observe(this.frame);
   }
@@ -94,8 +94,8 @@ class Strip {
   }
 
   /** A cross of a kind with a name, or none. */
-  mark(name, place, kind, words) {
-    this.put(name, place && this.width ? s("g", { "data-at": place.join(" "), transform: `translate(${place.join(" ")}) scale(${1 / this.scale})` }, cross(0, 0, kind, 13), words ? s("text", { x: 9, y: -8 }, words) : null) : null);
+  mark(name, place, kind, text) {
+    this.put(name, place && this.width ? s("g", { "data-at": place.join(" "), transform: `translate(${place.join(" ")}) scale(${1 / this.scale})` }, cross(0, 0, kind, 13), text ? s("text", { x: 9, y: -8 }, text) : null) : null);
   }
 
   put(name, mark) {
@@ -178,32 +178,32 @@ class Strip {
 }
 
 export class PanoramaPanel {
-  constructor(events, target, tell) {
-    Object.assign(this, { events, target, tell, all: [], targets: {} });
+  constructor(events, target, announce) {
+    Object.assign(this, { events, target, announce, all: [], targets: {} });
     this.strip = new Strip((pixel) => this.clicked(pixel));
-    this.choice = h("select", { "aria-label": "Panorama", onchange: () => { this.chosen = this.choice.value; this.look(); } });
-    this.stands = h("p", { class: "quiet", id: "pano-state", role: "status" });
+    this.choice = h("select", { "aria-label": "Panorama", onchange: () => { this.chosen = this.choice.value; this.refresh(); } });
+    this.progress = h("p", { class: "quiet", id: "pano-state", role: "status" });
     this.more = h("button", { type: "button", hidden: true, onclick: () => this.take({ resume: this.one.id }) }, "Go on");
     this.seams = h("p", { id: "seams" });
     this.bar = h("div", { class: "pano-bar", hidden: true }, this.strip.buttons, this.choice, this.more);
     this.pair = h("select", { "aria-label": "Cameras" });
-    this.angles = ["Pan from", "to", "Tilt from", "to"].map((words, k) => h("input", { inputmode: "decimal", autocomplete: "off", size: 5, "aria-label": `${k < 2 ? "Pan" : "Tilt"}, ${k % 2 ? "to" : "from"}, degrees`, id: `pano-${k}` }));
+    this.angles = ["Pan from", "to", "Tilt from", "to"].map((text, k) => h("input", { inputmode: "decimal", autocomplete: "off", size: 5, "aria-label": `${k < 2 ? "Pan" : "Tilt"}, ${k % 2 ? "to" : "from"}, degrees`, id: `pano-${k}` }));
     this.go = h("button", { type: "submit", class: "go" }, "Take a panorama");
     this.field = h("form", { class: "angles", onsubmit: (event) => { event.preventDefault(); this.begin(); } },
-      this.go, ["Pan", "Tilt"].map((words, k) => h("span", {}, `${words} `, this.angles[2 * k], " to ", this.angles[2 * k + 1], " °")), this.pair);
+      this.go, ["Pan", "Tilt"].map((text, k) => h("span", {}, `${text} `, this.angles[2 * k], " to ", this.angles[2 * k + 1], " °")), this.pair);
     this.bad = h("p", { class: "bad", role: "alert" });
     this.name = h("input", { "aria-label": "Name of the target", placeholder: "name", maxlength: 40, required: true });
     this.keeps = h("button", { type: "submit" }, "Keep");
     this.keeper = h("form", { class: "angles", id: "keep-target", onsubmit: (event) => { event.preventDefault(); this.keepTarget(); } }, h("span", { class: "quiet" }), this.name, this.keeps);
     this.list = h("ul", { id: "kept-targets" });
-    this.exports = h("p", { hidden: true }, "Save as ", [["CSV", "text/csv", csv], ["JSON", "application/json", features]].map(([words, type, text]) => h("a", { class: "save", href: "#", download: `targets.${words.toLowerCase()}`, onclick: ({ currentTarget }) => { currentTarget.href = URL.createObjectURL(new Blob([text(this.targets)], { type })); } }, words)).flatMap((one, k) => (k ? [", ", one] : [one])));
-    put(byId("panorama"), this.strip.frame, this.bar, this.stands, this.seams, this.field, this.bad, h("h3", {}, "Targets kept by a name"), this.list, this.exports, this.keeper);
-    events.addEventListener("connected", () => this.look());
-    events.addEventListener("command", ({ detail: { value } }) => { if (/^(target|panorama)/.test(value.command ?? "")) this.look(); });
-    events.addEventListener("operation", ({ detail: { value } }) => { if (typeof value.request?.panorama === "string") this.look(); });
+    this.exports = h("p", { hidden: true }, "Save as ", [["CSV", "text/csv", csv], ["JSON", "application/json", features]].map(([kind, type, text]) => h("a", { class: "save", href: "#", download: `targets.${kind.toLowerCase()}`, onclick: ({ currentTarget }) => { currentTarget.href = URL.createObjectURL(new Blob([text(this.targets)], { type })); } }, kind)).flatMap((one, k) => (k ? [", ", one] : [one])));
+    put(byId("panorama"), this.strip.frame, this.bar, this.progress, this.seams, this.field, this.bad, h("h3", {}, "Targets kept by a name"), this.list, this.exports, this.keeper);
+    events.addEventListener("connected", () => this.refresh());
+    events.addEventListener("command", ({ detail: { value } }) => { if (/^(target|panorama)/.test(value.command ?? "")) this.refresh(); });
+    events.addEventListener("operation", ({ detail: { value } }) => { if (typeof value.request?.panorama === "string") this.refresh(); });
     events.addEventListener("joints", () => { this.turned = true; });
     document.addEventListener("target-changed", () => this.show());
-    setInterval(() => document.hidden || (this.taking() ? this.look() : this.overlay()), POLL_MS);
+    setInterval(() => document.hidden || (this.taking() ? this.refresh() : this.overlay()), POLL_MS);
   }
 
   use({ limits }, { cameras }) {
@@ -229,7 +229,7 @@ export class PanoramaPanel {
     } catch (error) {
       say(this.bad, error.message);
     }
-    this.look();
+    this.refresh();
   }
 
   begin() {
@@ -250,10 +250,10 @@ export class PanoramaPanel {
     return state === "running" && [...(this.events.known.get("operation")?.values() ?? [])].some((one) => one.request?.panorama === id && !one.ended_s);
   }
 
-  /** What there is: the panoramas, the newest first, and the kept targets. One question at a time. */
-  async look() {
-    if (this.looking) { this.again = true; return; }
-    this.looking = true;
+  /** What there is: the panoramas, the newest first, and the kept targets. One request at a time. */
+  async refresh() {
+    if (this.refreshing) { this.again = true; return; }
+    this.refreshing = true;
     try {
       [this.all, this.targets] = (await Promise.all([get("/panoramas"), get("/targets")])).map((one) => one.panoramas ?? one.targets);
       this.one = this.all.find(({ id }) => id === this.chosen) ?? this.all[0];
@@ -266,7 +266,7 @@ export class PanoramaPanel {
       if (error.status && error.status !== 401) say(this.bad, error.message);
     }
     this.show();
-    setTimeout(() => { this.looking = false; if (this.again) { this.again = false; this.look(); } }, POLL_MS / 2);
+    setTimeout(() => { this.refreshing = false; if (this.again) { this.again = false; this.refresh(); } }, POLL_MS / 2);
   }
 
   /** The picture and what its seams say, where another view came or it was composed. */
@@ -284,7 +284,7 @@ export class PanoramaPanel {
     put(this.seams, whole ? [`Seams: ${pixels(whole.rms_px)} px rms in x and y of ${whole.count} patches (the matches alone: ${pixels(whole.sigma_px)} px)`, whole.across_px ? `; across the parallax ${number(whole.across_px[0], 2)} px (${number(whole.across_px[1], 2)} px)` : "", ". ", slip ? h("strong", { class: "warn" }, sentence(slip.sentence), ".") : ""] : []);
   }
 
-  /** Where the head looks now, and the targets, in the picture's pixels. */
+  /** The camera's present view, and the targets, in the picture's pixels. */
   async overlay() {
     const { one, turned } = this;
     if (!one?.views.taken || !turned || !this.events.connected) return;
@@ -322,22 +322,22 @@ export class PanoramaPanel {
     if (!one) return;
     this.choice.value = one.id;
     const { taken = 0, missing = 0, forbidden = 0, wanted = 0 } = one.views;
-    const left = [missing && `${missing} missing`, forbidden && `${forbidden} left out: limits or keep-outs`].filter(Boolean).map((words) => `, ${words}`).join("");
+    const left = [missing && `${missing} missing`, forbidden && `${forbidden} left out: limits or keep-outs`].filter(Boolean).map((text) => `, ${text}`).join("");
     const count = `${taken} of ${taken + missing + wanted + forbidden} views${left}`;
     const running = taken && !wanted ? "composing the mosaic" : "STOP ends it, and what was taken is kept";
-    if (taking) say(this.stands, `Taking: ${count}; ${running}.`);
-    else say(this.stands, one.state === "done" ? `${count}. Click a point to see its range.` : `Ended early: ${count}. ${sentence(inDegrees(one.reason || "the daemon ended meanwhile."))}`);
+    if (taking) say(this.progress, `Taking: ${count}; ${running}.`);
+    else say(this.progress, one.state === "done" ? `${count}. Click a point to see its range.` : `Ended early: ${count}. ${sentence(inDegrees(one.reason || "the daemon ended meanwhile."))}`);
     this.more.hidden = taking || (one.state === "done" && !missing);
   }
 
   clicked(pixel) {
-    if (this.one?.state !== "done") return this.tell("The panorama can be clicked when it is whole.", true);
+    if (this.one?.state !== "done") return this.announce("The panorama can be clicked when it is whole.", true);
     this.target.choosePanorama(this.one.id, pixel);
   }
 
   row(name, { position_m: place, frame, covariance_m2: covariance }) {
     const sigma = covariance ? ` ± ${number(Math.sqrt(covariance[0][0] + covariance[1][1] + covariance[2][2]), 3)}` : "";
-    const button = (words, act) => h("button", { type: "button", class: "quiet", "aria-label": `${words} ${name}`, disabled: !this.may, onclick: act }, words);
+    const button = (text, act) => h("button", { type: "button", class: "quiet", "aria-label": `${text} ${name}`, disabled: !this.may, onclick: act }, text);
     return h("li", {}, h("strong", {}, name), h("span", { class: "quiet" }, `${place.map((value) => number(value, 2, true)).join(", ")}${sigma} m, ${frame}`),
       h("span", {}, button("Point at", () => this.target.begin({ label: `Target ${name}`, old: "", request: { position_m: place, frame } })), " ", button("Forget", () => this.act(() => ask("DELETE", `/targets/${encodeURIComponent(name)}`)))));
   }
@@ -348,7 +348,7 @@ export class PanoramaPanel {
     return this.act(async () => {
       await post(`/targets/${encodeURIComponent(name)}`, { position_m: position, frame: "rover", ...(covariance ? { covariance_m2: covariance } : {}) });
       this.name.value = "";
-      this.tell(`${name} is kept.`);
+      this.announce(`${name} is kept.`);
     });
   }
 }
