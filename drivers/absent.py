@@ -31,12 +31,8 @@ Opening = Future[Any]
 class Absence:
     """Whether a device is away. Each failed try doubles the wait before the next one, up to a bound.
 
-    Attributes
-    ----------
-    error
-        Why it is away; None while it is here.
-    again_s
-        When to try again, on the clock of the caller, seconds.
+    ``error`` says why it is away, None while it is here; ``again_s`` is when to try again, on the caller's
+    clock, seconds.
     """
 
     def __init__(self) -> None:

@@ -65,15 +65,9 @@ def legs_to(
 ) -> list[int]:
     """Return the goals of a move, the last one after another where it has to be approached from one side.
 
-    Parameters
-    ----------
-    goal, stretch, limits
-        Where the axis is to come to rest, how long its last stretch is at least, and the lowest and highest
-        goal, all in the device's counts.
-    turn
-        Which way the counts go on the last stretch: 1, -1, or 0 for either.
-    places
-        Where the axis is or comes to rest before it can turn; None if unknown.
+    All are in the device's counts. ``turn``: which way the counts go on the last stretch, 1, -1, or 0 for
+    either; ``stretch``: its length at least; ``limits``: the lowest and the highest goal; ``places``: where
+    the axis is or comes to rest before it can turn, None if unknown.
     """
     low, high = limits
     start = min(max(goal - turn * stretch, low), high)

@@ -12,12 +12,8 @@ from collections.abc import Mapping
 class DriverError(Exception):
     """Base of every fault that a device or its stand-in reports.
 
-    Parameters
-    ----------
-    device
-        The device's name, put before the message.
-    detail
-        Facts for programs (port, servo id, register, instruction); must be JSON.
+    The device's name is put before the message. ``detail`` are facts for programs (port, servo id, register,
+    instruction); must be JSON.
     """
 
     code = "driver_error"

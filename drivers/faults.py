@@ -248,7 +248,7 @@ class FaultPanel:
         fault = self._fault(device, word, parameters)
         with self._lock:
             self._entries[device, word] = (_Entry(fault),)
-        self._tell()
+        self._notify()
         return fault
 
     def _fault(self, device: str, word: str, parameters: Mapping[str, Any]) -> Fault:
@@ -277,16 +277,11 @@ class FaultPanel:
         return Fault(device, word, MappingProxyType(values), begin_s, begin_s + values["for_s"])
 
     def set_all(self, faults: Any, origin: str = "simulation.faults") -> None:
-        """Set the faults of a script, beside those that are set.
+        """Set the faults of a script, a list of mappings with ``device``, ``word`` and the word's parameters.
 
-        Raises BadOptions as ``set``, or when it is not such a list; then nothing was set.
-
-        Parameters
-        ----------
-        faults
-            A list of mappings with ``device``, ``word`` and the word's parameters. ``at_s`` says the same
-            as ``after_s``: seconds from now. The same word may come more than once; where two of them are in
-            force, the later one of the list is.
+        They are beside those that are set. ``at_s`` says the same as ``after_s``: seconds from now. Of a word
+        that comes more than once, the later one of those in force counts. Raises BadOptions as ``set``, or
+        when it is not such a list; then nothing was set.
         """
         if not isinstance(faults, list | tuple):
             raise BadOptions(f"{origin} is {faults!r}, expected a list of {{device, word, ...}}")
@@ -305,7 +300,7 @@ class FaultPanel:
             for one in made:
                 key = (one.fault.device, one.fault.word)
                 self._entries[key] = (*self._entries.get(key, ()), one)
-        self._tell()
+        self._notify()
 
     def clear(self, device: str | None = None, word: str | None = None) -> None:
         """Take back all faults of one device, or of every device; with a word only those of that word.
@@ -320,9 +315,9 @@ class FaultPanel:
                 for (its_device, its_word), entries in self._entries.items()
                 if device not in (None, its_device) or word not in (None, its_word)
             }
-        self._tell()
+        self._notify()
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         for changed in self._listeners:
             changed()
 

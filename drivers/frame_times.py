@@ -113,16 +113,10 @@ class Stamped(Protocol):
 class Offset:
     """What is known of two cameras before frames of them are taken.
 
-    Attributes
-    ----------
-    period_s
-        From frame to frame, of the slower one; infinite where it is not known.
-    usual_s
-        How much later the other one exposes, seconds; None before it is learned and where it is not constant.
-    began_s
-        When an exposure of the first one began: the others are whole periods away. None if not known.
-    counts_apart
-        By how much the other one's count is higher for the same trigger; None for free-running cameras.
+    ``period_s``: from frame to frame, of the slower one; infinite where it is not known. ``usual_s``: how
+    much later the other one exposes; None before it is learned and where it is not constant. ``began_s``:
+    when an exposure of the first one began, the others are whole periods away. ``counts_apart``: by how much
+    the other one's count is higher for the same trigger; None for free-running cameras.
     """
 
     period_s: float = math.inf

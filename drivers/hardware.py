@@ -93,14 +93,9 @@ class DeviceSettings:
 
 @dataclass(frozen=True)
 class HardwareSettings:
-    """All devices of a configuration.
+    """All devices of a configuration, and its folder, where relative paths in options start.
 
-    Attributes
-    ----------
-    simulation
-        The ``simulation`` section, which makes the one rover that all ``sim`` devices share.
-    folder
-        Where relative paths in options start: the configuration's folder.
+    ``simulation`` is the section that makes the one rover that all ``sim`` devices share.
     """
 
     pan_tilt: DeviceSettings
@@ -112,13 +107,8 @@ class HardwareSettings:
 class Hardware:
     """Open devices. A context manager: leaving it closes them, the head first.
 
-    Attributes
-    ----------
-    kind
-        ``real``, ``simulated``, ``replayed``, or ``mixed``: by the drivers, and for devices of a real one by
-        their ``info``.
-    simulation
-        The simulated rover behind ``sim`` devices, or None; only for experiments, tests and faults.
+    ``simulation`` is the simulated rover behind ``sim`` devices, or None; only for experiments, tests and
+    faults.
     """
 
     def __init__(

@@ -24,16 +24,10 @@ Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Reading:
-    """Joint state as *measured*, not as commanded.
+    """Joint state as *measured*, not as commanded: angles in radians, positive pan right, positive tilt up.
 
-    Attributes
-    ----------
-    pan_rad, tilt_rad
-        Measured joint angles, radians (positive pan right, positive tilt up).
-    moving
-        Whether an axis is under way or not yet in position.
-    time_s
-        When it was measured, seconds of CLOCK_MONOTONIC.
+    ``moving``: an axis is under way or not yet in position. ``time_s``: when it was measured,
+    CLOCK_MONOTONIC.
     """
 
     pan_rad: float
@@ -152,13 +146,8 @@ class AxisMotion:
 class HeadInfo:
     """What a head states of itself; whatever it does not know keeps its default.
 
-    Attributes
-    ----------
-    stops_beside
-        Whether its ``stop`` is confirmed sooner beside a call under way than after it: then a stop does not
-        wait for the call.
-    settles_within_counts
-        How many counts from its goal an axis may stand when it calls itself settled.
+    ``stops_beside``: its ``stop`` is confirmed sooner beside a call under way than after it, so a stop does
+    not wait for the call. ``settles_within_counts``: how many counts from its goal a settled axis may stand.
     """
 
     simulated: bool = False
@@ -217,16 +206,10 @@ SETTINGS: Mapping[str, str] = MappingProxyType(
 
 @dataclass(frozen=True)
 class CameraSetting:
-    """One setting of a camera as it is now.
+    """One setting of a camera as it is now; of an unknown value (its automatic is on) ``value`` is None.
 
-    Attributes
-    ----------
-    value
-        None if it is not known: its automatic is on, or the camera does not say.
-    minimum, maximum, step
-        Its bounds; a step of 0: any value between them.
-    refusal
-        Why it cannot be changed, as the end of a sentence that begins with its name; empty if it can.
+    A step of 0: any value between the bounds. ``refusal``: why it cannot be changed, as the end of a sentence
+    that begins with its name; empty if it can.
     """
 
     name: str

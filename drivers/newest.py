@@ -90,15 +90,9 @@ class TimedFrame(Frame):
 class Counters:
     """Counts of a camera's frames since it was opened.
 
-    Attributes
-    ----------
-    good, damaged
-        Frames that were published, and frames that were refused (error flag, lost packets, length, stamp).
-        The first ones of a stream are neither, where nothing shows yet when their exposure began.
-    dropped
-        Frames that never came, by gaps in the camera's count.
-    late
-        Good frames that came more than a period and 5 ms after their stamp.
+    Good ones were published, damaged ones refused (error flag, lost packets, length, stamp). The first ones
+    of a stream are neither, where nothing shows yet when their exposure began. Dropped ones never came, by
+    gaps in the camera's count. Late are good ones that came more than a period and 5 ms after their stamp.
     """
 
     good: int = 0

@@ -25,14 +25,9 @@ from drivers.interfaces import Image
 class PictureFormat:
     """A picture's format, as the camera's driver set it.
 
-    Attributes
-    ----------
-    stride_bytes
-        From one row to the next, of the first plane; 0 for compressed formats.
-    field
-        1 for whole pictures; other values are interlaced.
-    planes_bytes
-        The most that each plane takes, where the camera captures in planes of their own; empty elsewhere.
+    ``stride_bytes`` is from one row to the next, of the first plane, 0 for compressed formats; ``field`` is 1
+    for whole pictures, others are interlaced; ``planes_bytes`` the most that each plane takes, where the
+    camera captures in planes of their own.
     """
 
     code: str
@@ -48,14 +43,9 @@ Kind = Literal["grey", "bayer", "yuyv", "uyvy", "nv12", "jpeg", "rgb", "bgr"]
 
 @dataclass(frozen=True)
 class Layout:
-    """How a format is laid out.
+    """How a format is laid out: of a Bayer format ``order`` has the colours of the first two by two samples.
 
-    Attributes
-    ----------
-    order
-        Of a Bayer format: the colours of the first two by two samples.
-    packed
-        The samples that share one byte more than they are; 0 for samples that stand in whole bytes.
+    ``packed``: the samples that share one byte more than they are; 0 for samples that stand in whole bytes.
     """
 
     kind: Kind

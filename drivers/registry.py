@@ -74,14 +74,9 @@ class ProbedCamera:
 
 @dataclass(frozen=True)
 class UnitBench:
-    """What is done with a pan/tilt unit on the bench.
+    """What is done with a pan/tilt unit on the bench; ``bauds`` has the usual rate first.
 
-    Attributes
-    ----------
-    bauds
-        The rates of its line, the usual one first.
-    facts, home
-        ``facts(port, baud)`` returns what the unit reports; so does ``home``, after a reset.
+    ``facts(port, baud)`` returns what the unit reports; so does ``home``, after a reset.
     """
 
     bauds: Sequence[int]
@@ -93,17 +88,10 @@ class UnitBench:
 class CameraBench:
     """What is done with a camera that no daemon has.
 
-    Attributes
-    ----------
-    key, title
-        Of the table of connected cameras, in JSON and for people.
-    table
-        The connected cameras, each as column and text or list of texts, and a sentence for each that this
-        user may not open.
-    present
-        ``present(options, name)`` says which camera has answered; no stream is begun. Raises DriverError.
-    options_for
-        Options of a camera that a person names at the command line; None where only a configuration does.
+    ``table`` returns the connected cameras, each as column and text or list of texts (``key`` names it in
+    JSON, ``title`` for people), and a sentence for each that this user may not open. ``present(options,
+    name)`` says which camera has answered; no stream is begun. Raises DriverError. ``options_for`` returns
+    options of a camera that a person names at the command line; None where only a configuration does.
     """
 
     key: str
@@ -128,15 +116,10 @@ HardwareKind = Literal["real", "simulated", "replayed", "mixed"]
 
 @dataclass(frozen=True)
 class Context:
-    """What a driver gets beside its options.
+    """What a driver gets beside its options; relative paths in options start at ``folder``.
 
-    Attributes
-    ----------
-    folder
-        Where relative paths in options start: the configuration's folder.
-    shared
-        What devices of one configuration have in common, by a key of the driver's own, such as one simulated
-        rover. What has a ``close`` is closed after the devices.
+    ``shared`` is what devices of one configuration have in common, by a key of the driver's own, such as one
+    simulated rover. What has a ``close`` is closed after the devices.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The simulation's clock: time that passes only while nobody computes, as fast as is wanted.
+"""The simulation's clock: time that passes only while no thread computes, as fast as is wanted.
 
 Threads that the clock knows of (`SimulationClock.thread`, `SimulationClock.at_work`) take turns: one
 computes at a time, in an order that depends on nothing but what they did before. While one computes, time
@@ -7,12 +7,12 @@ moment that one of them waits for: at once (``speed`` infinite), or as fast as r
 would. So deadlines mean what they mean on a rover whose computer takes no time, and the same commands give
 the same run to the last bit.
 
-At infinite speed the clock stands still when nobody waits for a result, only for work or for the next round
-(``idle``): between two commands no time passes, however long the next one lets wait. At a finite speed it
-goes on.
+At infinite speed the clock stands still when no thread waits for a result, only for work or for the next
+round (``idle``): between two commands no time passes, however long the next one lets wait. At a finite speed
+it goes on.
 
 Threads that the clock does not know may wait on it too, and time passes for them; it does not wait while
-they compute. Who is at work must not wait for another such thread beside the clock: not in a
+they compute. A thread at work must not wait for another such thread beside the clock: not in a
 `threading.Thread.join`, and not for a lock that the other one keeps while it waits on the clock.
 """
 
@@ -36,7 +36,7 @@ MAX = "max"
 
 
 def simulation_speed(value: Any) -> float:
-    """Return the speed that ``simulation.speed`` asks for: seconds in a second, infinite for ``max``.
+    """Return the speed that ``simulation.speed`` requests: seconds in a second, infinite for ``max``.
 
     Raises BadOptions for anything but a number from 0.1 to 1000 or ``max``.
     """
@@ -57,7 +57,7 @@ class _Member:
 
 
 class _Waiting:
-    """Somebody who waits: for the turn, for a moment, for a signal."""
+    """A thread that waits: for the turn, for a moment, for a signal."""
 
     def __init__(
         self,
@@ -244,7 +244,7 @@ class SimulationClock:
         self._go_on()
 
     def _release(self, waiting: _Waiting) -> None:
-        """Let somebody go on: a member at its turn, anybody else at once."""
+        """Let a thread go on: a member at its turn, any other at once."""
         self._waiting.remove(waiting)
         if waiting.member is None:
             waiting.gone_on.set()
@@ -252,7 +252,7 @@ class SimulationClock:
             self._ready.append(waiting)
 
     def _go_on(self) -> None:
-        """Give the turn to whoever is next, if nobody has it; let time pass if nobody can go on now."""
+        """Give the turn to the next, if none has it; let time pass if none can go on now."""
         while self._turn is None:
             if self._ready or self._guests:
                 self._stand()
@@ -302,7 +302,7 @@ class SimulationSignal:
         self._lock.release()
 
     def wait(self, timeout_s: float | None = None, *, idle: bool = False) -> bool:
-        """Let go of the lock, wait, and take it again; return whether somebody has notified."""
+        """Let go of the lock, wait, and take it again; return whether it was notified."""
         waiting = self._clock.begin_wait(timeout_s, self, idle)
         self._lock.release()
         try:
@@ -339,7 +339,7 @@ class _Thread(threading.Thread):
 
 
 def _pace(wanted: weakref.ref[SimulationClock], central: threading.Condition) -> None:
-    """Let real time bring the moments of a clock for as long as somebody has it; in a thread of its own."""
+    """Let real time bring the moments of a clock for as long as it is in use; in a thread of its own."""
     with central:
         while (clock := wanted()) is not None:
             left_s = clock.brought_s()

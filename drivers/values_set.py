@@ -105,14 +105,8 @@ def change_each(
 ) -> tuple[dict[str, float], list[str], DriverError | None]:
     """Change settings one after the other, and note from which frame on each is in force.
 
-    Returns
-    -------
-    became
-        The new value of each that was changed, as the camera has it.
-    notes
-        A sentence for each that became another than requested.
-    refused
-        The error of one that the camera did not take; those behind it were left alone.
+    Returns the new value of each that was changed, as the camera has it; a sentence for each that became
+    another than requested; and the error of one that the camera did not take, those behind it left alone.
     """
     became: dict[str, float] = {}
     notes: list[str] = []

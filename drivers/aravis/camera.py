@@ -58,15 +58,11 @@ class ClockStepped(Exception):
 
 @dataclass
 class CameraClock:
-    """Bounds of our clock minus the camera's, seconds; of one stream.
+    """Bounds of our clock minus the camera's, seconds, of one stream; when they were last looked at, at
+    ``at_s``.
 
-    Attributes
-    ----------
-    least_delay_s
-        At its best, the path brings a frame's first packet at most so long after its stamp. It counts only
-        for a camera whose clock cannot be read.
-    low_s, high_s
-        The bounds when they were last looked at, at ``at_s``.
+    ``least_delay_s``: at its best, the path brings a frame's first packet at most so long after its stamp. It
+    counts only for a camera whose clock cannot be read.
     """
 
     least_delay_s: float
@@ -125,16 +121,10 @@ class CameraClock:
 
 
 class ArrivedGenicam(NamedTuple):
-    """A good frame, without its picture.
+    """A good frame, without its picture; the whole exposure lay in its window.
 
-    Attributes
-    ----------
-    filled, window
-        The buffer with the camera's own count and stamp, and in which the whole exposure lay.
-    settings
-        Those of this frame, by name: as it came with them, else as they were set; None for what is not known.
-    sequence, stream
-        Our own count, which grows over every reopening, and the number of the stream.
+    ``sequence`` is our own count, which grows over every reopening; a setting that is not known of it is
+    None.
     """
 
     filled: Filled

@@ -57,14 +57,8 @@ STATUS = {
 class Filled(NamedTuple):
     """A buffer that came back, still ours until it is queued again.
 
-    Attributes
-    ----------
-    number
-        The camera's count: 16 bits that leave out 0, or 64 bits.
-    stamp_s, arrived_s
-        The camera's stamp by its own clock, and when its first packet came, seconds of CLOCK_MONOTONIC.
-    sent
-        The settings that the camera sent with it (chunk data), by name.
+    ``number`` is the camera's count: 16 bits that leave out 0, or 64 bits. ``stamp_s`` is of its own clock,
+    ``arrived_s`` when its first packet came by CLOCK_MONOTONIC. ``sent`` came with it (chunk data).
     """
 
     handle: int
@@ -110,17 +104,10 @@ class WallClock:
 class Device:
     """A camera that streams. Closing it gives everything back.
 
+    ``period_s`` is None of a triggered camera. ``values`` are its settings at the opening, None for one that
+    its automatic sets. ``lost`` is set when it no longer obeys: it was unplugged, or another program took it.
     Raises UnsupportedFormat if format, size or rate are not to be had; the message says what is; DriverError
     if the camera cannot be opened or does not start.
-
-    Attributes
-    ----------
-    format, period_s
-        As the camera answered; a triggered camera has a period of None.
-    values
-        Its settings by name, as they are at the opening; None for one that its automatic sets.
-    lost
-        Set when the camera no longer obeys: it was unplugged, or another program took it.
     """
 
     def __init__(self, options: AravisOptions, name: str, adjusted: Mapping[str, float]) -> None:
@@ -169,7 +156,7 @@ class Device:
         wanted = {name: value for name, value in by_options.items() if value is not None}
         self.values, others = set_up(arv, camera, {**wanted, **self._adjusted})
         self.problems += others
-        self._ask_chunks()
+        self._request_chunks()
         self._find_latch()
         self.sensor_mode = self._sensor_mode()
         for problem in self.problems:
@@ -263,7 +250,7 @@ class Device:
             )
         return 1 / rate_hz if rate_hz > 0 else None
 
-    def _ask_chunks(self) -> None:
+    def _request_chunks(self) -> None:
         """Have each frame bring its own exposure time and gain, where the camera can."""
         arv, camera = self._arv, self._camera
         if "ChunkModeActive" in self._options.features:

@@ -122,16 +122,10 @@ NEAREST = ": the camera's nearest"
 
 @dataclass(frozen=True)
 class Feature:
-    """Which features a setting is.
+    """Which features a setting is: ``feature`` (also as chunk data) and ``automatic`` by GenICam's names.
 
-    Attributes
-    ----------
-    feature, automatic
-        The GenICam names of its value, also as chunk data, and of its automatic.
-    called
-        How Aravis calls it in its functions.
-    unit
-        Of the camera's own number, in that of `SETTINGS`.
+    ``called`` is its name in Aravis's functions, ``unit`` that of the camera's own number in that of
+    `SETTINGS`.
     """
 
     name: str
@@ -200,14 +194,8 @@ def set_up(
 ) -> tuple[dict[str, float | None], list[str]]:
     """Set what is wanted, by name, of a camera that is being opened.
 
-    Raises GenicamError if it refuses one.
-
-    Returns
-    -------
-    values
-        Of each setting that it has, None for one that its automatic sets.
-    problems
-        A sentence for each that it lacks, or that became another.
+    Returns the value of each setting that it has (None: its automatic sets it), and a sentence for each that
+    it lacks or that became another. Raises GenicamError if it refuses one.
     """
     values: dict[str, float | None] = {}
     problems: list[str] = []

@@ -180,10 +180,8 @@ class Link(BusLink):
     def ping_all(self) -> tuple[list[Pinged], int]:
         """Ping every servo on the line; takes its whole window of about a second. Raises LineLost.
 
-        Returns
-        -------
-        list of Pinged, int
-            Those that answered, by id; and how many bytes came that were no reply (two servos of one id?).
+        Returns those that answered, by id; and how many bytes came that were no reply (two servos of one
+        id?).
         """
         port = self.port
         question = instruction_packet(BROADCAST_ID, PING)

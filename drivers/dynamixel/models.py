@@ -18,7 +18,7 @@ from typing import Annotated, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from calib.files.records import ABSENT, problem
-from drivers.dynamixel.registers import ControlItem, vendor_names, vendor_table
+from drivers.dynamixel.registers import ControlItem, vendor_table
 from drivers.errors import BadOptions
 from drivers.faults import nearest
 from drivers.options import read_options
@@ -186,21 +186,8 @@ def model_named(name: str) -> ServoModel:
     for known, model in MODELS.items():
         if wanted.removesuffix("-T").removesuffix("-R") == known.removesuffix("-T"):
             return model
-    for number, theirs in vendor_names().items():
-        if number not in MODELS_BY_NUMBER and wanted.startswith(theirs.upper().replace("_", "-")):
-            raise BadOptions(f"the driver does not know {what_is_needed(number)}")
-    raise BadOptions(f"there is no servo model {name!r}{nearest(wanted, MODELS)}")
-
-
-def what_is_needed(number: int) -> str:
-    """Return what a servo is that the driver does not drive, and what it would need, by its model number."""
-    theirs = vendor_names().get(number)
-    if theirs is None:
-        return f"the model number {number}, nor do the tables of the installed dynamixel-sdk"
-    return (
-        f"the {theirs} (model number {number}). Needed is a row in drivers/dynamixel/models.py: its unit of "
-        "current and its backlash, and registers laid out as those of X or P"
-    )
+    hint = nearest(wanted, MODELS)
+    raise BadOptions(f"there is no servo model {name!r}{hint}; another needs a row in dynamixel/models.py")
 
 
 def hardware_error_names(value: int) -> list[str]:

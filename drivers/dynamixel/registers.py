@@ -99,11 +99,6 @@ def vendor_table(number: int) -> VendorTable:
     return VendorTable(_registers(found["control table"]), *ends)
 
 
-def vendor_names() -> Mapping[int, str]:
-    """Return every servo that the SDK has a table of, as it spells them, by model number."""
-    return {number: file.stem for number, file in _files().items()}
-
-
 @cache
 def _files() -> Mapping[int, Path]:
     """The SDK's tables by model number; found without importing it, which takes a serial library along."""

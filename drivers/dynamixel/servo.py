@@ -21,7 +21,6 @@ from drivers.dynamixel.models import (
     DynamixelAxisSettings,
     DynamixelSettings,
     hardware_error_names,
-    what_is_needed,
 )
 from drivers.dynamixel.packets import GroupAnswer
 from drivers.dynamixel.registers import ControlItem, RegisterBlock
@@ -171,9 +170,10 @@ class Servo(ServoTable, BusServo):
         if number != model.number:
             other = MODELS_BY_NUMBER.get(number)
             if other is None:
-                raise WrongDevice(
-                    f"{self.name} is no {model.name}: the driver does not know {what_is_needed(number)}"
+                message = (
+                    f"{self.name} is no {model.name}: the driver does not know the model number {number}"
                 )
+                raise WrongDevice(message)
             raise WrongDevice(f"{self.name} is a {other.name}, the configuration says {model.name}")
         if self._head.watchdog_s > 0 and firmware < model.watchdog_firmware:
             raise WrongDevice(

@@ -16,9 +16,7 @@ from drivers.dynamixel.models import (
     ServoModel,
     hardware_error_names,
     register_meaning,
-    what_is_needed,
 )
-from drivers.dynamixel.registers import vendor_names
 from drivers.dynamixel.servo import ServoTable, identified
 from drivers.errors import NoReply, Refused, WrongDevice
 from drivers.servo_bus.bench import (
@@ -42,7 +40,7 @@ def _found(link: Link, ping: Pinged) -> FoundServo:
     errors: list[str] = []
     if ping.alert and model is not None:
         errors = hardware_error_names(table_of(link, ping.servo_id, model).get("hardware_error"))
-    name = model.name if model else vendor_names().get(ping.model_number, "unknown")
+    name = model.name if model else f"model number {ping.model_number}"
     return FoundServo(link.baud, ping.servo_id, ping.model_number, name, ping.firmware, tuple(errors))
 
 
@@ -69,8 +67,8 @@ def _known(pinged: Pinged) -> ServoModel:
     """The model of a servo. Raises WrongDevice."""
     model = MODELS_BY_NUMBER.get(pinged.model_number)
     if model is None:
-        needed = what_is_needed(pinged.model_number)
-        raise WrongDevice(f"servo {pinged.servo_id}: the driver does not know {needed}")
+        message = f"servo {pinged.servo_id}: the driver does not know the model number {pinged.model_number}"
+        raise WrongDevice(message)
     return model
 
 

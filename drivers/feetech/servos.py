@@ -248,12 +248,8 @@ class FeetechLink(BusLink):
         return self.request(servo_id, PING, b"", 0).error
 
     def ping_all(self) -> tuple[list[int], int]:
-        """Ping every servo on the line. Raises LineLost, BadReply.
-
-        Returns
-        -------
-        list of int, int
-            The ids that answered; and how many bytes came that were no reply: two servos spoke at once.
+        """Return the ids that answer a ping to all, and how many bytes came that were no reply: two servos
+        spoke at once. Raises LineLost, BadReply.
         """
         port = self.port
         port.send(instruction_packet(BROADCAST_ID, PING), 0)

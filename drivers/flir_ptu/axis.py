@@ -278,15 +278,9 @@ class StepAxis:
 class StepCount:
     """The evidence against the positions that a unit reports.
 
-    Attributes
-    ----------
-    lost
-        By axis, why its count is lost; empty while it is good. It stays lost.
-    suspected
-        Where the axes stood, rad, when a limit hit was reported of one that stood still; empty if none was.
-        To be checked, and then compared by `compare_places`.
-    halt_owed
-        Whether a moving axis has hit its limit since the unit was halted last (halting clears this).
+    ``lost`` says by axis why its count is lost; it stays lost. ``suspected`` is where the axes stood, rad,
+    when a limit hit was reported of one that stood still: to be checked, and then compared by
+    `compare_places`. ``halt_owed``: whether a moving axis has hit its limit since the unit was halted last.
     """
 
     def __init__(self) -> None:

@@ -43,16 +43,10 @@ GIVING_WAY_S = 2.0  # how long a reading begins anew where one stop comes after 
 def open_head(
     options: Mapping[str, Any], clock: Clock | None = None, open_line: OpenLine = SerialLine
 ) -> FlirPtu:
-    """Return the open head that the options name.
+    """Return the open head that the options name; its readings are stamped by ``clock``.
 
     Raises BadOptions for options that cannot be used; WrongDevice if what answers does not fit them;
     LineLost, NoReply, BadReply, Refused.
-
-    Parameters
-    ----------
-    clock
-        Stamps the readings, and deadlines run on it if it goes on by itself; the machine's monotonic clock
-        when left out.
     """
     return FlirPtu(options_from(options), clock or SystemClock(), open_line)
 

@@ -48,14 +48,9 @@ ACCELERATION = _axis_query("A", "AXIS", "acceleration")
 
 @dataclass(frozen=True)
 class PtuAnswer:
-    """One answer of the unit.
+    """One answer of the unit: ``*`` (good) or ``!``, with an echo of the command or without.
 
-    Attributes
-    ----------
-    good
-        ``*``, as opposed to ``!``.
-    exact
-        Whether it did letter by letter, capitals and small ones.
+    ``exact``: whether the echo is so letter by letter, capitals and small ones.
     """
 
     good: bool
@@ -110,12 +105,8 @@ def answer_of(line: bytes, command: str) -> PtuAnswer | None:
 def number_of(text: str, terms: tuple[str, ...], verbose: bool) -> float | None:
     """Return the one number in a query's answer; None if the answer is not to that query.
 
-    Parameters
-    ----------
-    terms
-        Lower-case terms that a verbose answer to this query holds: ``("current", "pan", "position")``.
-    verbose
-        Whether the unit answers in sentences; a terse answer is the number alone.
+    A ``verbose`` answer holds lower-case ``terms``, such as current, pan, position; a terse one is the number
+    alone.
     """
     tokens = text.split()
     if not verbose:

@@ -27,7 +27,7 @@ from drivers.flir_ptu.conversation import Conversation
 
 log = logging.getLogger(__name__)
 
-ASKED_AT_MOST = 12  # questions for one axis; three or four do on a good line
+MOST_QUERIES = 12  # questions for one axis; three or four do on a good line
 MOST_BEND_RAD = 0.01
 """How far tilt may be from the straight line, by what its speed changes there."""
 
@@ -56,7 +56,7 @@ def measure(talk: Conversation, pan: StepAxis, tilt: StepAxis, clock: Clock) -> 
     while found is None:
         for axis, answers in seen_of.items():
             if axis not in at_rest and found is None:
-                if len(answers) == ASKED_AT_MOST:
+                if len(answers) == MOST_QUERIES:
                     positions = ", ".join(str(seen.position) for seen in answers)
                     raise BadReply(
                         f"gives {axis.name} positions that contradict each other: {positions}", device=DEVICE

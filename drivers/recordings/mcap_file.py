@@ -42,14 +42,8 @@ class BadRecording(DriverError):
 class McapContents:
     """The findings while a file was read; they grow as the reading goes on.
 
-    Attributes
-    ----------
-    complete
-        Whether the file was ended by its writer, index and all.
-    damaged
-        Chunks and records that were passed over because they are not what was written.
-    whole_bytes
-        Up to where records are whole; the rest was being written when the writer died.
+    ``complete``: the file was ended by its writer, index and all. ``damaged`` chunks and records are passed
+    over. Up to ``whole_bytes`` records are whole; the rest was being written when the writer died.
     """
 
     complete: bool = False

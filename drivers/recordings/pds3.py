@@ -74,14 +74,9 @@ class Quantity(NamedTuple):
 
 @dataclass(frozen=True)
 class LabelBlock:
-    """A group or object of a label, or the whole label.
+    """A ``GROUP`` or ``OBJECT`` of a label, or the whole label, whose kind and name are ''.
 
-    Attributes
-    ----------
-    kind, name
-        ``GROUP`` or ``OBJECT`` and its name; both '' for the whole label.
-    values
-        Keyword to int, float, str, Quantity, or a tuple of these. The first, where a keyword is there twice.
+    Values are int, float, str, Quantity, or a tuple of these; the first, where a keyword is there twice.
     """
 
     kind: str
@@ -356,7 +351,6 @@ class PdsProduct:
     elevation_measured_rad: float | None
     image: NDArray[Any] | None
     size_px: tuple[int, int]
-    calibration_source_id: str
     product_id: str
     notes: tuple[str, ...]
 
@@ -381,7 +375,7 @@ def read_product(path: str | Path, with_image: bool = True) -> PdsProduct:
         _integer_in(image_block, "LINE_SAMPLES", path, 1, LARGEST_IMAGE_PX),
         _integer_in(image_block, "LINES", path, 1, LARGEST_IMAGE_PX),
     )
-    model, frame, source, notes = _camera(label, Path(path), size)
+    model, frame, notes = _camera(label, Path(path), size)
     azimuth, elevation = _mast_angles(label, Path(path))
     image = None
     if with_image:
@@ -395,7 +389,6 @@ def read_product(path: str | Path, with_image: bool = True) -> PdsProduct:
         elevation_measured_rad=elevation,
         image=image,
         size_px=size,
-        calibration_source_id=source,
         product_id=str(label.values.get("PRODUCT_ID", "")),
         notes=notes,
     )
@@ -409,12 +402,12 @@ def _label(data: bytes, path: str | Path) -> LabelBlock:
 
 def _camera(
     label: LabelBlock, path: Path, size_px: tuple[int, int]
-) -> tuple[CameraModel | None, str, str, tuple[str, ...]]:
-    """Return the camera model, its frame, its calibration source and notes."""
+) -> tuple[CameraModel | None, str, tuple[str, ...]]:
+    """Return the camera model, its frame, and notes."""
     blocks = [b for b in label.every() if b.name.startswith("GEOMETRIC_CAMERA_MODEL")]
     kinds = [b for b in blocks if b.values.get("MODEL_TYPE") in _COMPONENTS]
     if not kinds:
-        return None, "", "", ()
+        return None, "", ()
     block = kinds[0]
     notes = () if len(kinds) == 1 else (f"the first of {len(kinds)} camera models of the label is read",)
     kind = cast(Kind, block.values["MODEL_TYPE"])
@@ -439,8 +432,7 @@ def _camera(
     frame = block.values.get("REFERENCE_COORD_SYSTEM_NAME")
     if not isinstance(frame, str) or not frame.isprintable() or not frame:
         raise BadFile(path, f"{block.name}.REFERENCE_COORD_SYSTEM_NAME", "the frame's name is missing")
-    source = block.values.get("CALIBRATION_SOURCE_ID", "")
-    return model, frame, str(source) if isinstance(source, (int, str)) else "", notes + model_notes
+    return model, frame, notes + model_notes
 
 
 def _mast_angles(label: LabelBlock, path: Path) -> tuple[float | None, float | None]:

@@ -73,7 +73,7 @@ def changing(link: BusLink, family: str, old: int, new: int, new_baud: int | Non
     except BaseException as error:
         ids = f"{old}" if new == old else f"{old} or {new}"
         bauds = f"{before}" if new_baud in (None, before) else f"{before} {new_baud}"
-        scan = f"'mastctl rig servo scan {line_words(link.name, family)} --baud {bauds}' shows which"
+        scan = f"'mastctl rig servo scan {line_arguments(link.name, family)} --baud {bauds}' shows which"
         left = f"the servo is left with the id {ids} at {bauds.replace(' ', ' or ')} baud: {scan}"
         message = f"{str(error) or 'interrupted'}; {left}"
         if isinstance(error, DriverError):
@@ -81,7 +81,7 @@ def changing(link: BusLink, family: str, old: int, new: int, new_baud: int | Non
         raise WrongDevice(message) from error
 
 
-def line_words(port: str, family: str) -> str:
+def line_arguments(port: str, family: str) -> str:
     """Return a line as commands name it, with the family of its servos."""
     return f"{quote(port)} --family {family}"
 
@@ -90,14 +90,8 @@ def line_words(port: str, family: str) -> str:
 class ServoBench:
     """What is done with servos of one family on the bench.
 
-    Attributes
-    ----------
-    present
-        Returns the servos that answer on a line, and how many bytes came that were no reply.
-    bauds, likely_bauds
-        Rates of a scan and of a probe, that of the factory or the likeliest first.
-    models, usual_model
-        Those that the driver turns, and one for a configuration before any is plugged in.
+    ``present`` returns the servos that answer on a line, and how many bytes came that were no reply. Of the
+    rates that of the factory or the likeliest is first. ``models`` are those that the driver turns.
     """
 
     family: str
@@ -113,7 +107,7 @@ class ServoBench:
 
     def numbering(self, port: str, baud: int) -> str:
         """Return the command that gives a new servo, alone on a line, the second id."""
-        return f"mastctl rig servo set-id {line_words(port, self.family)} 1 2 --baud {baud}"
+        return f"mastctl rig servo set-id {line_arguments(port, self.family)} 1 2 --baud {baud}"
 
     def one_id(self, port: str, baud: int) -> str:
         """Return what to do where one id is all that answers."""

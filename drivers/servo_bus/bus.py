@@ -64,11 +64,8 @@ class _Job:
 class Bus:
     """The owner thread of a bus.
 
-    Parameters
-    ----------
-    between
-        Called in the thread whenever no call waits; returns the time of the clock, seconds, at which it
-        wants to run again. It must keep what goes wrong itself; what it raises is only logged.
+    ``between`` is called in the thread whenever no call waits, and returns the time of the clock, seconds, at
+    which it wants to run again. It must keep what goes wrong itself; what it raises is only logged.
     """
 
     def __init__(self, name: str, between: Callable[[], float], clock: Clock | None = None) -> None:
@@ -103,19 +100,12 @@ class Bus:
         first: bool = False,
         moves: bool = False,
     ) -> T:
-        """Run ``function`` in the owner thread and return its result.
+        """Run ``function`` in the owner thread and return its result; it must end by itself in bounded time.
 
-        Raises NoReply if it did not end in time, and if it had not begun then, it never will; or a stop broke
-        it off; DriverError (what ``function`` raises).
-
-        Parameters
-        ----------
-        function
-            Talks on the line; must end by itself in bounded time.
-        first
-            Go before everything that waits, and have what is under way break off (see `urgent`): a stop.
-        moves
-            Do not begin if a call with ``first`` came after this one.
+        With ``first`` it goes before everything that waits, and what is under way breaks off (see `urgent`):
+        a stop. With ``moves`` it does not begin if a call with ``first`` came after it. Raises NoReply if it
+        did not end in time, and if it had not begun then, it never will; or a stop broke it off; DriverError
+        (what ``function`` raises).
         """
         if self._closing is not None:
             raise NoReply(f"{self._name} is closed; {what} was not sent")

@@ -39,21 +39,9 @@ SETTLES_WITHIN_COUNTS = 3
 class BusHead(PanTilt):
     """The head; every method may be called from any thread. A family of servos says what it is made of.
 
-    Raises LineLost, NoReply, WrongDevice, HardwareFault, Refused.
-
-    Parameters
-    ----------
-    clock
-        Stamps the readings. Deadlines run on it too if it runs, else on the machine's.
-    open_line
-        Opens the line, whose waits end by the clock of the deadlines.
-
-    Attributes
-    ----------
-    settings_type, link_type, pair_type
-        Of its options, its line, and the two servos on that.
-    memory_type
-        Of what outlasts a line of the head, and each `ServoPair` is given.
+    The ``clock`` stamps the readings; deadlines run on it too if it runs, else on the machine's.
+    ``memory_type`` is of what outlasts a line of the head; each `ServoPair` is given it. Raises LineLost,
+    NoReply, WrongDevice, HardwareFault, Refused.
     """
 
     settings_type: ClassVar[type[HeadSettings]]

@@ -404,12 +404,8 @@ class ServoPair(ABC):
 class SessionWatch(ABC):
     """Watches for what servos do by themselves, from when they were made ready until the line is given up.
 
-    Attributes
-    ----------
-    tripped
-        Whether silence has stopped a motion; latched until `end_trip`.
-    trip_fault, trip_refusal
-        The fault, and the refusal of moves, while tripped.
+    ``tripped``: silence has stopped a motion; latched until `end_trip`. Then there is the fault
+    ``trip_fault``, and moves are refused with ``trip_refusal``.
     """
 
     trip_fault = ""

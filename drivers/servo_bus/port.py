@@ -26,12 +26,8 @@ REPLY_UNDER_WAY_S = 0.01  # how long it then lets a reply come in that would col
 class StatusPacket:
     """A servo's reply.
 
-    Attributes
-    ----------
-    refused
-        Why the servo did not do as instructed; 0 if it did.
-    alert
-        Whether it reports a fault of its own.
+    ``refused``: why the servo did not do as instructed, 0 if it did. ``alert``: it reports a fault of its
+    own.
     """
 
     servo_id: int
@@ -90,14 +86,8 @@ def at_header(buffer: bytearray, header: bytes) -> bool:
 class PacketFormat:
     """What the packets of a family of servos look like.
 
-    Attributes
-    ----------
-    address_bytes
-        Of an address, and of a length beside it, little-endian.
-    instructions, refusals
-        What codes mean, for messages.
-    to_nobody
-        A write to no servo, which none obeys or answers: an adapter that gives it back echoes.
+    An address, and a length beside it, have ``address_bytes``, little-endian. ``to_nobody`` is a write to no
+    servo, which none obeys or answers: an adapter that gives it back echoes.
     """
 
     take: Take
@@ -122,26 +112,13 @@ class Overtaken(Exception):
 
 
 class Port:
-    """An open line to servos, for one thread at a time.
+    """An open line to servos, for one thread at a time; ``name`` and ``baud`` are as of `SerialLine`.
 
-    Raises Overtaken from every method that sends or waits, while something urgent waits; not from `send_now`;
-    LineLost, BadOptions.
-
-    Parameters
-    ----------
-    name, baud
-        As of `SerialLine`.
-    urgent
-        Says that something urgent waits for the line: then nothing more is sent and no wait goes on.
-    clock
-        Deadlines run on it; the machine's when left out. The line's own waits have to end by it too.
-
-    Attributes
-    ----------
-    suspect
-        Whether a reply may still be under way: then it is listened until the line is quiet before sending.
-    echoes
-        Whether the adapter gives back what is sent (half duplex): then that is dropped before a reply.
+    While ``urgent`` says that something urgent waits, every method that sends or waits raises Overtaken; not
+    `send_now`. Deadlines run on the ``clock``; the line's own waits have to end by it too. While it is
+    ``suspect`` a reply may still be under way: then it is listened until the line is quiet before sending. Of
+    an adapter that ``echoes`` (half duplex) what was sent is dropped before a reply. Raises LineLost,
+    BadOptions.
     """
 
     def __init__(
@@ -199,14 +176,10 @@ class Port:
             self._urgent = urgent
 
     def send(self, packet: bytes, reply_bytes: int) -> float:
-        """Send a packet after what came in unasked was dropped, and start the deadline of its reply.
+        """Send a packet after what came in unrequested was dropped, and start the deadline of its reply.
 
-        Raises BadReply if the line is never quiet; LineLost.
-
-        Returns
-        -------
-        float
-            A moment just before it was sent, seconds of the clock.
+        Returns a moment just before it was sent, seconds of the clock. Raises BadReply if the line is never
+        quiet; LineLost.
         """
         self._fetch(0.0)
         if self.suspect or (self._past_echo() and self._buffer):

@@ -144,7 +144,7 @@ class V4l2Camera(CapturedCamera[Arrived]):
         A change that this camera's group decided on before is first made, and waited for until it shows, for
         eight periods (1 s) at most. What was not made by then is made after the block. A change of settings
         that was made before is waited for likewise. Raises StreamFailed if the camera is still at such a
-        change after that time: nobody could say when it takes effect.
+        change after that time: it is unknown when it takes effect.
         """
         control = self._exposure
         if control is None:

@@ -16,7 +16,7 @@ from drivers.v4l2.node import Node, reason
 Value = int | str | bool
 
 _MOST_CONTROLS = 1024
-_TYPE_WORDS = {
+_TYPE_NAMES = {
     abi.CTRL_TYPE_INTEGER: "integer",
     abi.CTRL_TYPE_BOOLEAN: "boolean",
     abi.CTRL_TYPE_MENU: "menu",
@@ -26,7 +26,7 @@ _TYPE_WORDS = {
     abi.CTRL_TYPE_BITMASK: "bitmask",
     abi.CTRL_TYPE_INTEGER_MENU: "menu",
 }
-_SETTABLE = _TYPE_WORDS.keys() - {abi.CTRL_TYPE_STRING}
+_SETTABLE = _TYPE_NAMES.keys() - {abi.CTRL_TYPE_STRING}
 
 _REASONS = {
     errno.EACCES: "it cannot be changed now; its automatic may be on",
@@ -39,17 +39,11 @@ _REASONS = {
 
 @dataclass(frozen=True)
 class CameraControl:
-    """One control as the driver describes it.
+    """One control as the driver describes it; its name is as `plain_name` spells it.
 
-    Attributes
-    ----------
-    id, name
-        The kernel's number, and the name in lower case with underscores: ``exposure_time_absolute``.
-    kind
-        ``integer``, ``integer64``, ``boolean``, ``menu``, ``bitmask``, ``button``, ``string``, or
-        ``type 263`` for one that this program does not know; the last two can be listed but not set.
-    settable
-        Whether it takes a value (perhaps not now: an inactive one waits for its automatic to be off).
+    ``kind`` is ``integer``, ``integer64``, ``boolean``, ``menu``, ``bitmask``, ``button``, ``string``, or
+    ``type 263`` for one that this program does not know; the last two can be listed but not set.
+    ``settable``: it takes a value (perhaps not now: an inactive one waits for its automatic to be off).
     """
 
     id: int
@@ -155,7 +149,7 @@ def plain_name(name: str) -> str:
 
 
 def _control(node: Node, query: ctypes.Structure) -> CameraControl:
-    kind = _TYPE_WORDS.get(query.type, f"type {query.type}")
+    kind = _TYPE_NAMES.get(query.type, f"type {query.type}")
     if query.flags & abi.CTRL_FLAG_HAS_PAYLOAD and kind != "string":
         kind = f"type {query.type}"
     menu = _menu(node, query) if query.type in (abi.CTRL_TYPE_MENU, abi.CTRL_TYPE_INTEGER_MENU) else {}

@@ -1,7 +1,7 @@
 """Automatic exposure of our own: between measurements it brings a percentile of the grey levels to a target.
 
 The camera's own automatic is off, because it would change pictures in the middle of a measurement and the two
-eyes of a pair apart from each other. One `ExposureControl` serves all cameras of a group, which so always
+cameras of a pair apart from each other. One `ExposureControl` serves all cameras of a group, which so always
 have the same exposure; it looks at the brightest of them.
 """
 

@@ -86,7 +86,7 @@ def list_cameras() -> list[FoundCamera]:
             with Node(path) as node:
                 identity = node.identity
         except DriverError:
-            continue  # an output, a metadata node, or one of somebody else's
+            continue  # an output, a metadata node, or one without permission
         found.append(
             FoundCamera(path, identity.driver, identity.card, identity.bus, tuple(stable_links(path)))
         )

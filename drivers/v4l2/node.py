@@ -341,7 +341,7 @@ class Node:
 
     def _unmap(self) -> None:
         for mapping in chain.from_iterable(self._maps):
-            with contextlib.suppress(BufferError):  # somebody still looks at a frame: it goes with that
+            with contextlib.suppress(BufferError):  # a frame is still in use: it goes with that
                 mapping.close()
         self._maps = []
 

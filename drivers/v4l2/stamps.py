@@ -56,14 +56,9 @@ class Timing(NamedTuple):
 
 
 class Arrived(NamedTuple):
-    """A good frame, without its picture.
+    """A good frame, without its picture: the kernel's buffer with the driver's own count and stamp.
 
-    Attributes
-    ----------
-    buffer, format
-        The kernel's buffer with the driver's own count and stamp, and what its bytes mean.
-    sequence, stream
-        Our own count, which grows over every reopening, and the number of the stream.
+    ``sequence`` is our own count, which grows over every reopening, ``stream`` the number of the stream.
     """
 
     buffer: Dequeued

@@ -33,20 +33,11 @@ UNKNOWN_RATE_HZ = 5.0  # a period longer than any that a camera without a rate i
 class Stream:
     """A camera with its format, rate and controls set, streaming. Closing it gives everything back.
 
-    Raises UnsupportedFormat if format, size or rate are not to be had, the message says what is; and for an
-    exposure longer than a frame, for which a camera stretches its frames; DriverError if the camera cannot be
-    opened or does not start.
-
-    Attributes
-    ----------
-    rate_hz, period_s
-        The rate that the camera answered, or the requested one where it does not say; from frame to frame.
-    rate_known
-        Whether the camera itself reports that rate.
-    exposure_s
-        The exposure time by the camera's own word, None if unknown: also where its automatic stayed on.
-    requested_exposure_s
-        The exposure time that was set last, before the camera rounded it.
+    ``rate_known``: the camera itself reports its rate; else it is the requested one. ``exposure_s`` is by the
+    camera's own statement, None if unknown: also where its automatic stayed on. ``requested_exposure_s`` was
+    set last, before the camera rounded it. Raises UnsupportedFormat if format, size or rate are not to be
+    had, the message says what is; and for an exposure longer than a frame, for which a camera stretches its
+    frames; DriverError if the camera cannot be opened or does not start.
     """
 
     def __init__(

@@ -88,7 +88,6 @@ def test_an_attached_label_gives_camera_angles_frame_and_image(tmp_path: Path) -
     np.testing.assert_allclose(model.O, printed_o / np.linalg.norm(printed_o), rtol=0, atol=1e-15)
     assert (product.azimuth_measured_rad, product.elevation_measured_rad) == (-0.340449, -0.10962)
     assert (product.frame, product.product_id) == ("ROVER_FRAME", "1N000000000TEST")
-    assert product.calibration_source_id == "33"
     assert product.image is not None
     np.testing.assert_array_equal(product.image, PIXELS)
 
@@ -251,4 +250,3 @@ def test_opportunitys_hazcam_is_a_cahvore_of_type_3(reference_data: Path) -> Non
     model = product.camera_model
     assert model is not None
     assert (model.kind, model.cahvore_type, model.linearity) == ("CAHVORE", 3, 0.37)
-    assert product.calibration_source_id == "33"

@@ -13,7 +13,7 @@ from drivers.errors import BadOptions, CameraBusy, DriverError, NoCamera, NoPerm
 from drivers.faults import PAN_TILT
 from drivers.hardware import DeviceSettings, clock_for, is_hardware
 from drivers.registry import Driver, UnitBench, driver_of, installed_drivers
-from drivers.servo_bus.bench import ServoBench, line_words
+from drivers.servo_bus.bench import ServoBench, line_arguments
 from mastctl.config import Config, check_cameras, load_config
 from mastctl.safety.state_folder import usual_folder
 from mastctl.setup.machine import (
@@ -134,7 +134,7 @@ def _head_options(head: DeviceSettings, driver: Driver, port: str) -> Iterator[D
     yield DoctorFinding("head", "good", message)
     if not isinstance(driver.bench, ServoBench):
         return
-    ids, line = (read.pan.servo_id, read.tilt.servo_id), line_words(port, head.driver)
+    ids, line = (read.pan.servo_id, read.tilt.servo_id), line_arguments(port, head.driver)
     message = f"pan is servo {ids[0]} and tilt servo {ids[1]}; 'mastctl rig servo scan {line}' lists them"
     new = next((number for number in ids if number != 1), 2)
     advice = f"a new servo has the id 1: connect it alone, then mastctl rig servo set-id {line} 1 {new}"
