@@ -56,11 +56,11 @@ def _reference(args: argparse.Namespace) -> Answer:
         if not cameras:
             raise CommandError("no_camera", "the daemon has no camera on the head")
         with output.waiting(args.json, f"taking images at {len(rests)} poses"):
-            taken = take_pictures(client, rests, cameras)
-    if taken.missing:
-        which, why = next(iter(taken.missing.items()))
+            pictures, missing = take_pictures(client, rests, cameras)
+    if missing:
+        which, why = next(iter(missing.items()))
         raise CommandError("no_picture", f"no reference was taken: {which}: {why}")
-    saved = save_reference(args.folder, now_utc(), rests, taken.pictures)
+    saved = save_reference(args.folder, now_utc(), rests, pictures)
     document = {
         "folder": str(args.folder), "pictures": len(saved.pictures), "rests": [list(rest) for rest in rests]
     }  # fmt: skip

@@ -80,14 +80,18 @@ class SeenAgain:
 class WouldBe:
     """A pointing with another mast file.
 
-    ``commanded_rad`` and ``range_m`` as it would have had them; ``residual_px`` and ``sigma_px``: what would
-    have been left, and one sigma of it. None, and a sentence in ``error``, where it has no answer.
+    ``commanded_rad`` and ``range_m`` as it would have had them; ``would_be_px`` and ``sigma_px``: the
+    residual that would have been left, and one sigma of it. None, and a sentence in ``error``, without one.
     """
 
-    seen: SeenAgain
+    operation: str
+    pointing: int
+    frame_id: str
+    recorded_px: FloatArray
+    recorded_commanded_rad: tuple[float, float]
     commanded_rad: tuple[float, float] | None = None
     range_m: float | None = None
-    residual_px: FloatArray | None = None
+    would_be_px: FloatArray | None = None
     sigma_px: FloatArray | None = None
     error: str = ""
 
@@ -191,15 +195,16 @@ def pointings_with(rig: Rig, seen: Sequence[SeenAgain]) -> list[WouldBe]:
 
 def _would_be(rig: Rig, seen: SeenAgain, servo_rad: FloatArray) -> WouldBe:
     """One pointing with another mast file."""
+    one = WouldBe(seen.operation, seen.pointing, seen.frame_id, seen.residual_px, seen.commanded_rad)
     missing = [name for name in (*seen.pair, seen.aim_camera) if name not in rig.cameras]
     if missing:
-        return WouldBe(seen, error=f"the mast file has no camera {missing[0]}")
+        return replace(one, error=f"the mast file has no camera {missing[0]}")
     try:
         commanded, range_m, residual = _residual(rig, seen, seen.pair_px, seen.left_rad)
         sigma = _sigma(rig, seen, residual, servo_rad)
     except CalibError as error:
-        return WouldBe(seen, error=" ".join(str(error).split()))
-    return WouldBe(seen, commanded, range_m, residual, sigma)
+        return replace(one, error=" ".join(str(error).split()))
+    return replace(one, commanded_rad=commanded, range_m=range_m, would_be_px=residual, sigma_px=sigma)
 
 
 def _residual(
@@ -308,7 +313,7 @@ class WhatIf:
             "rms_px": {
                 key: {"recorded": rms(was), "would_be": rms(would)} for key, was, would in self.columns()
             },
-            "pointings": [_pointing_record(one) for one in self.pointings],
+            "pointings": as_json(self.pointings),
             "handoffs": as_json(self.handoffs),
             "not_worked_out": dict(self.others),
         }
@@ -317,18 +322,15 @@ class WhatIf:
         """Return, for first and later pointings and for each camera handed to: its name, residuals as they
         were recorded, and as they would have been.
         """
+        rows: list[tuple[str, WouldBe | HandedAgain]] = [
+            ("first pointing" if one.pointing == 1 else "second pointing", one) for one in self.pointings
+        ]
         found: dict[str, tuple[list[FloatArray], list[FloatArray]]] = {}
-        for one in self.pointings:
-            if one.residual_px is not None:
-                key = "first pointing" if one.seen.pointing == 1 else "second pointing"
+        for key, row in [*rows, *((f"hand-off to {one.camera}", one) for one in self.handoffs)]:
+            if row.would_be_px is not None:
                 was, would = found.setdefault(key, ([], []))
-                was.append(one.seen.residual_px)
-                would.append(one.residual_px)
-        for handed in self.handoffs:
-            if handed.would_be_px is not None:
-                was, would = found.setdefault(f"hand-off to {handed.camera}", ([], []))
-                was.append(handed.recorded_px)
-                would.append(handed.would_be_px)
+                was.append(row.recorded_px)
+                would.append(row.would_be_px)
         return [(key, *both) for key, both in sorted(found.items())]
 
 
@@ -343,11 +345,13 @@ def summary_table(what_if: WhatIf) -> Table:
 
 def pointing_table(what_if: WhatIf) -> Table:
     """Return each pointing."""
-    rows = []
-    for one in what_if.pointings:
-        would_be = x_y(one.residual_px, 3) or one.error
-        start = one.seen.operation, str(one.seen.pointing), x_y(one.seen.residual_px, 3)
-        rows.append([*start, would_be, x_y(one.sigma_px, 3)])
+    rows = [
+        [
+            one.operation, str(one.pointing), x_y(one.recorded_px, 3), x_y(one.would_be_px, 3) or one.error,
+            x_y(one.sigma_px, 3),
+        ]
+        for one in what_if.pointings
+    ]  # fmt: skip
     return Table(("operation", "pointing", "recorded (px)", "would be (px)", "sigma (px)"), rows)
 
 
@@ -415,18 +419,3 @@ def _plot(what_if: WhatIf) -> Figure:
         axis.set_aspect("equal")
         axis.legend(fontsize=8, loc="upper right")
     return plots.plot(figure, "residuals as recorded and as they would have been")
-
-
-def _pointing_record(one: WouldBe) -> dict[str, Any]:
-    return {
-        "operation": one.seen.operation,
-        "pointing": one.seen.pointing,
-        "frame_id": one.seen.frame_id,
-        "range_m": one.range_m,
-        "recorded_px": as_json(one.seen.residual_px),
-        "would_be_px": as_json(one.residual_px),
-        "sigma_px": as_json(one.sigma_px),
-        "commanded_rad": as_json(one.commanded_rad),
-        "recorded_commanded_rad": as_json(one.seen.commanded_rad),
-        "error": one.error,
-    }

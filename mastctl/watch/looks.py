@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -36,14 +36,6 @@ class LookEnded(MastctlError):
     code = "look_ended"
 
 
-@dataclass
-class Taken:
-    """Pictures of a look; ``missing``: why a camera, or one at a rest, gave none."""
-
-    pictures: list[ReferencePicture] = field(default_factory=list)
-    missing: dict[str, str] = field(default_factory=dict)
-
-
 def usual_rests(client: Client) -> list[tuple[float, float]]:
     """Return six rests: three pans over the limits at two tilts, where the ground is seen."""
     limits = client.status()["limits"]
@@ -66,14 +58,17 @@ def _in_use(client: Client, for_s: float) -> str:
     return "" if since_s >= for_s else f"the head was used {since_s:.0f} s ago; {for_s:.0f} s are waited for"
 
 
-def take_pictures(client: Client, rests: Sequence[Sequence[float]], cameras: Sequence[str]) -> Taken:
-    """Return a picture of each camera at each rest (pan, tilt as read), and bring the head back.
+def take_pictures(
+    client: Client, rests: Sequence[Sequence[float]], cameras: Sequence[str]
+) -> tuple[list[ReferencePicture], dict[str, str]]:
+    """Return an image of each camera at each rest (pan, tilt as read), and why a camera, or one at a rest,
+    gave none; bring the head back.
 
-    The client should hold the lease. A camera that gives no image is left out; the others go on. Raises
-    LookEnded if the head is stopped, ClientError if no camera gives a picture.
+    The client should have the lease. Raises LookEnded if the head is stopped, ClientError if no camera gives
+    an image.
     """
     joints = client.status()["joints"]
-    taken, left = Taken(), list(cameras)
+    pictures, missing, left = list[ReferencePicture](), dict[str, str](), list(cameras)
     try:
         for pose, (pan_rad, tilt_rad) in enumerate(rests):
             _turn(client, pan_rad, tilt_rad)
@@ -83,16 +78,16 @@ def take_pictures(client: Client, rests: Sequence[Sequence[float]], cameras: Seq
                 except ClientError as error:
                     if error.code in NOT_THE_CAMERA:
                         raise
-                    taken.missing[f"{camera} at rest {pose}"] = str(error)
+                    missing[f"{camera} at rest {pose}"] = str(error)
                     if error.code == "bad_frame":
                         continue  # too dark or too bright at this rest
                     left.remove(camera)
-                    if not left and not taken.pictures:
+                    if not left and not pictures:
                         raise
                     continue
                 if shot.moving:
                     raise LookEnded(f"the head moved while {camera} took its picture; nothing was kept")
-                taken.pictures.append(
+                pictures.append(
                     ReferencePicture(camera, pose, *shot.true_rad, shot.mast_digest, grey(shot.image))
                 )
         if joints is not None:
@@ -102,7 +97,7 @@ def take_pictures(client: Client, rests: Sequence[Sequence[float]], cameras: Seq
             with suppress(ClientError, LookEnded):  # refused if another client steers by now
                 _turn(client, joints["pan_rad"], joints["tilt_rad"])
         raise
-    return taken
+    return pictures, missing
 
 
 def _turn(client: Client, pan_rad: float, tilt_rad: float) -> None:
@@ -137,12 +132,12 @@ def look_again(client: Client, reference: Reference) -> SceneDrift:
             f"the reference is of {', '.join(reference.cameras) or 'no camera'}, the daemon has "
             f"{', '.join(served) or 'no camera on the head'}; take a new one"
         )
-    taken = take_pictures(client, reference.rests, cameras)
-    if any(one.mast_digest != reference.mast_digest for one in taken.pictures):
+    pictures, missing = take_pictures(client, reference.rests, cameras)
+    if any(one.mast_digest != reference.mast_digest for one in pictures):
         raise LookEnded("another mast file came into use during the look; nothing was kept")
-    drift = find_drift(rig, _view_shifts(rig, reference, taken.pictures), JOINT_SIGMA_RAD)
+    drift = find_drift(rig, _view_shifts(rig, reference, pictures), JOINT_SIGMA_RAD)
     gone = {name: "not configured any more" for name in reference.cameras if name not in served}
-    return replace(drift, missing=gone | taken.missing)
+    return replace(drift, missing=gone | missing)
 
 
 def _view_shifts(rig: Rig, reference: Reference, pictures: Sequence[ReferencePicture]) -> list[ViewShift]:

@@ -125,8 +125,8 @@ def test_the_tree_of_frames_puts_a_point_where_the_mast_file_sees_it(recorded: P
         ])  # fmt: skip
         above, moved = rover_from[one.parent_frame_id]
         rover_from[one.child_frame_id] = above @ turn, above @ np.array([t.x, t.y, t.z]) + moved
-    ((_, _, told_there),) = messages(recorded, "/camera/navcam_left/calibration")
-    camera = CameraCalibration.FromString(told_there.data)
+    ((_, _, calibration),) = messages(recorded, "/camera/navcam_left/calibration")
+    camera = CameraCalibration.FromString(calibration.data)
     turn, place = rover_from["navcam_left"]
     model = rig.camera_in_rover("navcam_left", 0.25, 0.0)
     for pixel in ([511.5, 383.5], [100.0, 700.0], [900.0, 50.0], [0.0, 0.0], [1023.0, 767.0]):
@@ -160,7 +160,7 @@ def test_cut_off_at_any_byte_it_keeps_the_chunks_before_for_repair(tmp_path: Pat
     assert counts == {0, 10, 20, 30}
 
 
-def test_a_chunk_that_was_damaged_is_passed_over_and_told(tmp_path: Path) -> None:
+def test_a_chunk_that_was_damaged_is_passed_over_and_counted(tmp_path: Path) -> None:
     path = tmp_path / "damaged.mcap"
     small(path)
     data = bytearray(path.read_bytes())

@@ -155,7 +155,7 @@ def test_a_folder_of_other_files_is_no_recording_and_keeps_them(tmp_path: Path) 
     assert folder.all() == []
 
 
-def test_a_disk_that_hangs_holds_nobody_and_what_was_dropped_is_told(
+def test_a_disk_that_hangs_delays_no_client_and_what_was_dropped_is_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     free, hangs = threading.Event(), threading.Event()
@@ -238,7 +238,7 @@ def test_a_disk_that_refuses_is_a_fault_and_is_tried_again(
     assert [n["number"] for n in records(files(tmp_path)[-1], "/command")] == [1]
 
 
-def test_the_room_of_others_is_left_free_the_ring_giving_way_first(
+def test_the_free_space_of_others_stays_the_oldest_segment_goes_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     left_mb = [5000.0]
@@ -342,7 +342,7 @@ def test_a_run_whose_file_goes_is_a_fault_until_the_next_one(
         assert [n["number"] for n in records(tmp_path / "recordings" / "elsewhere.mcap", "/command")] == [1]
 
 
-def test_another_mast_file_is_attached_and_its_cameras_told_when_it_comes(tmp_path: Path) -> None:
+def test_another_mast_file_is_attached_and_its_cameras_written_when_it_comes(tmp_path: Path) -> None:
     one = Recording(tmp_path)
     one.publish("joints", "pan_tilt", reading(0.1))
     one.written()
@@ -377,7 +377,7 @@ def test_an_operations_end_leaves_its_residuals_and_target_once(tmp_path: Path) 
     ]
 
 
-def test_a_value_that_cannot_be_told_spoils_nothing_else(tmp_path: Path) -> None:
+def test_a_value_that_cannot_be_written_spoils_nothing_else(tmp_path: Path) -> None:
     one = Recording(tmp_path)
     one.publish("frame", "navcam_left", "no frame at all")
     one.publish("command", "1", {"number": 1})

@@ -60,17 +60,8 @@ def recorded(mast_file: Path, true_file: Path, folder: Path) -> Path:
         publisher, service = Publisher(), daemon.service
         facts = {"hardware": "simulated"}
         find = service.devices.frame_by_id
-        recorder = Recorder(
-            settings,
-            folder,
-            lambda: mast,
-            attached,
-            facts,
-            publisher,
-            find,
-            service.event_value,
-            service.clock,
-        )
+        answers, clock = service.event_value, service.clock
+        recorder = Recorder(settings, folder, lambda: mast, attached, facts, publisher, find, answers, clock)
         recorder.start_run("")
         for x_px, y_px in CLICKS_PX:
             client.wait(client.point(pan_rad=0.0, tilt_rad=-0.1))
@@ -107,17 +98,17 @@ def would_be(recording: Recording, mast_file: Path) -> list[WouldBe]:
     return pointings_with(load_rig(mast_file).rig, seen)
 
 
-def test_the_right_mast_file_is_said_to_leave_what_it_really_leaves(files: dict[str, Path]) -> None:
-    said = would_be(read_whole(files["wrong run"]), files["right"])
+def test_the_right_mast_file_leaves_what_it_really_leaves(files: dict[str, Path]) -> None:
+    expected = would_be(read_whole(files["wrong run"]), files["right"])
     real = would_be(read_whole(files["right run"]), files["right"])
-    first = [one for one in said if one.seen.pointing == 1]
+    first = [one for one in expected if one.pointing == 1]
     assert len(first) == len(CLICKS_PX)
-    before = np.array([one.seen.residual_px for one in first])
+    before = np.array([one.recorded_px for one in first])
     assert np.abs(before).max() > 0.25  # the wrong file is felt, in these coarse pixels
     off, sigma = [], []
-    for one, other in zip(said, real, strict=True):
-        assert one.residual_px is not None and one.sigma_px is not None
-        off.append(one.residual_px - other.seen.residual_px)
+    for one, other in zip(expected, real, strict=True):
+        assert one.would_be_px is not None and one.sigma_px is not None
+        off.append(one.would_be_px - other.recorded_px)
         sigma.append(one.sigma_px)
     in_sigmas = np.abs(np.array(off)) / np.array(sigma)
     assert in_sigmas.max() < 3.5, in_sigmas
@@ -127,31 +118,24 @@ def test_the_right_mast_file_is_said_to_leave_what_it_really_leaves(files: dict[
 
 def test_with_its_own_mast_file_the_recorded_residuals_come_out(files: dict[str, Path]) -> None:
     for one in would_be(read_whole(files["wrong run"]), files["wrong"]):
-        assert one.residual_px is not None
-        assert one.residual_px == pytest.approx(one.seen.residual_px, abs=ROUNDED_PX)
+        assert one.would_be_px is not None
+        assert one.would_be_px == pytest.approx(one.recorded_px, abs=ROUNDED_PX)
 
 
-def test_the_command_tells_a_table_and_draws_a_page(
+def test_the_command_shows_a_table_and_draws_a_page(
     files: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = [
-        "record",
-        "replay",
-        str(files["wrong run"]),
-        "--mast",
-        str(files["right"]),
-        "--report",
-        str(tmp_path),
-    ]
-    assert main([*words, "--json"]) == 0
-    told: dict[str, Any] = json.loads(capsys.readouterr().out)
-    row = told["rms_px"]["first pointing"]
+    run, mast = str(files["wrong run"]), str(files["right"])
+    command = ["record", "replay", run, "--mast", mast, "--report", str(tmp_path)]
+    assert main([*command, "--json"]) == 0
+    answer: dict[str, Any] = json.loads(capsys.readouterr().out)
+    row = answer["rms_px"]["first pointing"]
     assert np.hypot(*row["would_be"]) < 0.2 * np.hypot(*row["recorded"])
     assert row["recorded"] == pytest.approx(
-        rms([np.array(one["recorded_px"]) for one in told["pointings"] if one["pointing"] == 1])
+        rms([np.array(one["recorded_px"]) for one in answer["pointings"] if one["pointing"] == 1])
     )
-    assert told["mast"]["name"] == "right.yaml" and told["recorded_mast"]["name"] == "wrong.yaml"
-    assert main(words) == 0
+    assert answer["mast"]["name"] == "right.yaml" and answer["recorded_mast"]["name"] == "wrong.yaml"
+    assert main(command) == 0
     shown = capsys.readouterr().out
     assert "would be rms" in shown and "what_if.html" in shown
     page = (tmp_path / "what_if.html").read_text()

@@ -1,4 +1,4 @@
-"""The self-check in service: what hand-offs tell together, and a record that cannot be written."""
+"""The self-check in service: what hand-offs say together, and a record that cannot be written."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def check(path: Path | None, thread: JournalThread) -> HandoffCheck:
     return HandoffCheck(path, DIGEST, ManualClock(10.0), thread)
 
 
-def test_a_turned_body_pair_is_told_after_enough_hand_offs(
+def test_a_turned_body_pair_is_reported_after_enough_hand_offs(
     rig: Rig, tmp_path: Path, caplog: pytest.LogCaptureFixture, thread: JournalThread
 ) -> None:
     first, *others = handed(rig, 20, yaw_rad=0.004)  # turned to the right: targets appear further left
@@ -91,7 +91,7 @@ def test_a_turned_body_pair_is_told_after_enough_hand_offs(
         assert offset["sigmas"] > 5.0
         assert f"{offset['camera']} sees targets" in offset["sentence"]
         assert "px left" in offset["sentence"] and "of where navcam puts them" in offset["sentence"]
-    assert sum("show an offset: hazcam_left" in words for words in caplog.messages) == 1, "told once"
+    assert sum("show an offset: hazcam_left" in line for line in caplog.messages) == 1, "logged once"
     thread.close()
     assert len(read_log(tmp_path / "h.jsonl").handoffs) == 20
 

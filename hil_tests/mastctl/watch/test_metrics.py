@@ -49,7 +49,7 @@ def scraped(metrics: Metrics) -> Found:
     }
 
 
-def test_the_status_is_told_as_it_is_when_somebody_asks(publisher: Publisher) -> None:
+def test_the_status_is_current_at_each_request(publisher: Publisher) -> None:
     status: Any = dict(STATUS)
     errors = {("pan_tilt", "read", "no_reply"): 3}
     metrics = Metrics(lambda: status, lambda: errors, dict, publisher, lambda: {"pan": 41.5})

@@ -87,8 +87,8 @@ def test_a_bumped_camera_is_seen_by_two_looks_and_reported_everywhere(
     assert (code, said.startswith(what)) == (1, True), said
     assert " sigma" in said and "since " in said
     assert stands(client) == pytest.approx(before, abs=1e-3)
-    told = client.sentinel()
-    assert (told["level"], undated(told["sentence"])) == ("bad", undated(said))
+    answer = client.sentinel()
+    assert (answer["level"], undated(answer["sentence"])) == ("bad", undated(said))
 
     def in_status() -> bool:
         found = client.status()["sentinel"]  # another test's finding may still stand there
@@ -97,7 +97,7 @@ def test_a_bumped_camera_is_seen_by_two_looks_and_reported_everywhere(
     until(in_status, "the finding in the status")
     assert client.status()["faults"] == [] and client.status()["state"] == "ready"
     health = client.calibration_health()
-    assert (health["verdict"], health["since"]) == ("drifts", told["since"])
+    assert (health["verdict"], health["since"]) == ("drifts", answer["since"])
     assert health["sentence"].startswith(f"reference pictures: {what}")
     assert client.status()["calibration"] == {
         key: health[key]  # type: ignore[literal-required]
@@ -112,18 +112,18 @@ def test_a_bumped_camera_is_seen_by_two_looks_and_reported_everywhere(
 
 def spoilt(folder: Path, to: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     shutil.copytree(folder, to)
-    told = json.loads((to / "reference.json").read_text())
-    change(told)
-    (to / "reference.json").write_text(json.dumps(told))
+    document = json.loads((to / "reference.json").read_text())
+    change(document)
+    (to / "reference.json").write_text(json.dumps(document))
     return to
 
 
 @pytest.mark.parametrize(
     ("change", "phrase"),
     [
-        (lambda told: told.update(mast_digest="0" * 64), "another mast file is in use than when"),
+        (lambda document: document.update(mast_digest="0" * 64), "another mast file is in use than when"),
         (
-            lambda told: [one.update(camera="pancam_left") for one in told["pictures"]],
+            lambda document: [one.update(camera="pancam_left") for one in document["pictures"]],
             "the reference is of pancam_left, the daemon has navcam_left, navcam_right; take a new one",
         ),
     ],
@@ -165,8 +165,8 @@ class Over(Exception):
 
 
 def watched(daemon: RunningDaemon, folder: Path, meddle: Callable[[], object]) -> list[str]:
-    """One turn of a watch that is due, with somebody who comes in the middle; what it told."""
-    told: list[str] = []
+    """One turn of a watch that is due, with somebody who comes in the middle; what it reported."""
+    reports: list[str] = []
 
     @contextmanager
     def connect() -> Iterator[Client]:
@@ -177,16 +177,9 @@ def watched(daemon: RunningDaemon, folder: Path, meddle: Callable[[], object]) -
         raise Over
 
     with pytest.raises(Over):
-        watch(
-            folder,
-            connect,
-            told.append,
-            lambda look: told.append(f"looked: {look['views']}"),
-            1e-3,
-            0.0,
-            sleep,
-        )
-    return told
+        looked = lambda result: reports.append(f"looked: {result['views']}")  # noqa: E731
+        watch(folder, connect, reports.append, looked, 1e-3, 0.0, sleep)
+    return reports
 
 
 def test_a_watch_looks_where_nobody_needs_the_head_and_lets_go_of_it(
@@ -201,8 +194,10 @@ def test_a_watch_ends_where_another_takes_over_and_starts_no_look_meanwhile(
     daemon: RunningDaemon, folder: Path, client: Client
 ) -> None:
     lease = []
-    told = watched(daemon, folder, lambda: lease.append(client.acquire_lease(for_s=60.0, take_over="mine")))
-    assert told == ["no look now: ana took over: mine; nothing was kept"]
+    reports = watched(
+        daemon, folder, lambda: lease.append(client.acquire_lease(for_s=60.0, take_over="mine"))
+    )
+    assert reports == ["no look now: ana took over: mine; nothing was kept"]
     last = [one["id"] for one in client.operations()]
     assert watched(daemon, folder, lambda: None) == ["no look now: ana steers"]
     assert [one["id"] for one in client.operations()] == last
@@ -222,9 +217,9 @@ def test_after_a_stop_in_the_middle_a_watch_moves_nothing_more(
         getattr(client, stop)()
         at.append(stands(client))
 
-    told = watched(daemon, folder, press)
+    reports = watched(daemon, folder, press)
     by = {"stop": "ana", "estop": "an emergency stop (ana)"}[stop]
-    assert told == [f"no look now: the head was stopped by {by}; nothing was kept"]
+    assert reports == [f"no look now: the head was stopped by {by}; nothing was kept"]
     assert stands(client) == at[0]
     (said,) = watched(daemon, folder, lambda: None)
     state = {"stop": "holding", "estop": "stopped"}[stop]
