@@ -19,7 +19,7 @@ import pytest
 
 from hil_tests.machine import debian
 from hil_tests.waiting import until
-from mastctl.answers.kinds import WELL
+from mastctl.answers import WELL
 from mastctl.client import Client, ClientError
 
 pytestmark = pytest.mark.long(4, "a whole Debian is made, mastctl installed and systemd booted in it")

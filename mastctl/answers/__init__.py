@@ -6,9 +6,6 @@ unless it is ``NotRequired``; others may come later.
 """
 
 from mastctl.answers.bench import *  # noqa: F403
-from mastctl.answers.events import *  # noqa: F403
 from mastctl.answers.keeping import *  # noqa: F403
-from mastctl.answers.kinds import *  # noqa: F403
 from mastctl.answers.motion import *  # noqa: F403
-from mastctl.answers.simulation import *  # noqa: F403
 from mastctl.answers.status import *  # noqa: F403

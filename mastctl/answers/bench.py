@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from annotated_types import Len
 from typing_extensions import TypedDict
 
-from mastctl.answers.kinds import MOST_CELLS, Angles, BenchState, BenchStep, Count, Json, MaybePixel
+from mastctl.answers.status import MOST_CELLS, Angles, BenchState, BenchStep, Count, Json, MaybePixel
 
 Cells = Annotated[list[Count], Len(MOST_CELLS, MOST_CELLS)]
 Pair = Annotated[list[float], Len(2, 2)]

@@ -131,7 +131,7 @@ def _ready(client: Client, wait_s: float) -> Status:
 
     A fault is waited for, since it may clear. A latched emergency stop is not: only a reset releases it.
     """
-    from mastctl.answers.kinds import WELL
+    from mastctl.answers import WELL
     from mastctl.client import ClientError
     from mastctl.client.connection import PASSING
 

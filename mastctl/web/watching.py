@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import FastAPI, Request, Response
 
 from mastctl import answers
-from mastctl.answers.kinds import WELL
+from mastctl.answers import WELL
 from mastctl.control.lease import Caller
 from mastctl.errors import Unable
 from mastctl.http import PREFIX
