@@ -26,10 +26,10 @@ RecordingKind = Literal["run", "kept", "ring"]
 
 
 class CameraMount(TypedDict):
-    """A configured camera: where it looks, by its frame's axes, and how much it sees.
+    """A configured camera: its direction, by its frame's axes, and its field.
 
     ``azimuth_rad`` (to the right), ``elevation_rad`` (up) of the optical axis; ``width_rad``, ``height_rad``
-    of its picture's middle row and column; of a stereo pair ``pair``, ``eye`` and the ``partner``.
+    of its picture's middle row and column; of a stereo pair ``pair``, ``side`` and the ``partner``.
     """
 
     on: Literal["head", "rover"]

@@ -163,7 +163,7 @@ class CameraSettingsTold(TypedDict):
 
     ``sensor_mode``: of the camera as it was opened, null where it does not know it.
 
-    ``notes``: a sentence for each setting that became another than asked for.
+    ``notes``: a sentence for each setting that became another than requested.
     """
 
     camera: str

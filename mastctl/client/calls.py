@@ -35,7 +35,7 @@ class Calls:
         return self.daemon.json(answers.SentinelTold, "GET", "/sentinel")
 
     def rig(self) -> answers.RigSummary:
-        """Return the configured cameras by the mast file in use: where each looks and how much it sees."""
+        """Return the configured cameras by the mast file in use: the direction and the field of each."""
         return self.daemon.json(answers.RigSummary, "GET", "/rig")
 
     def camera_settings(self, camera: str) -> answers.CameraSettingsTold:
@@ -153,7 +153,7 @@ class Calls:
         return self.daemon.json(answers.PlaceList, "GET", "/places")["places"]
 
     def keep_place(self, name: str, pan_rad: float, tilt_rad: float) -> dict[str, answers.HeadPlace]:
-        """Keep a place of the head by a name, for everybody; return all."""
+        """Keep a place of the head by a name, for all clients; return all."""
         body = {"pan_rad": pan_rad, "tilt_rad": tilt_rad}
         return self.daemon.command(answers.PlaceList, "POST", f"/places/{escaped(name)}", body)["places"]
 
@@ -246,7 +246,7 @@ class Calls:
         frame: Literal["rover", "site"] = "rover",
         covariance_m2: Sequence[Sequence[float]] | None = None,
     ) -> dict[str, answers.KeptTarget]:
-        """Keep a point by a name, for everybody, in the site frame if a pose is known; return all."""
+        """Keep a point by a name, for all clients, in the site frame if a pose is known; return all."""
         body = given(position_m=position_m, frame=frame, covariance_m2=covariance_m2)
         return self.daemon.command(answers.TargetList, "POST", f"/targets/{escaped(name)}", body)["targets"]
 

@@ -84,13 +84,13 @@ class LeaseCalls:
         next move otherwise.
         """
         granted = self.acquire_lease(name, for_s, take_over, ends_with_stop)
-        before, held = self.daemon.lease_id, HeldLease(self.daemon, granted, for_s)
-        self.daemon.lease_id = held.id
+        before, lease = self.daemon.lease_id, HeldLease(self.daemon, granted, for_s)
+        self.daemon.lease_id = lease.id
         try:
-            yield held
+            yield lease
         finally:
             self.daemon.lease_id = before
-            held.end()
+            lease.end()
 
     def control(self) -> answers.ControlTold | None:
         """Return the client that steers, or None."""

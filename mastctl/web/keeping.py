@@ -21,7 +21,7 @@ REPORT = (
     "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'none'"
 )
-"""The Content-Security-Policy of a report: its own styles and drawings, no script, an origin of nobody's."""
+"""The Content-Security-Policy of a report: its own styles and drawings, no script, and an origin of its own."""
 PlaceName = Annotated[
     str,
     Path(
@@ -82,7 +82,7 @@ def _mast_change(masts: Masts, mast: MastInUse) -> answers.MastChange:
 
 
 def add_places(app: FastAPI) -> None:
-    """Places of the head by a name; who goes there asks `POST /point` for its angles."""
+    """Places of the head by a name; `POST /point` goes to its angles."""
 
     @app.get(f"{PREFIX}/places", summary="The places of the head that are kept by a name")
     async def places(here: Here) -> answers.PlaceList:
@@ -181,8 +181,8 @@ def add_bench(app: FastAPI) -> None:
 
 def _without_file(body: BenchBody) -> dict[str, Any]:
     """What is recorded of a request: of a board's file its size and its digest."""
-    told = body.model_dump(exclude_none=True)
+    record = body.model_dump(exclude_none=True)
     if body.board_file is not None:
         digest = hashlib.sha256(body.board_file.encode("utf-8", "surrogatepass")).hexdigest()
-        told["board_file"] = f"{len(body.board_file)} signs, SHA-256 {digest[:16]}"
-    return told
+        record["board_file"] = f"{len(body.board_file)} signs, SHA-256 {digest[:16]}"
+    return record

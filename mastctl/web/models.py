@@ -6,7 +6,6 @@ import math
 from typing import Annotated, Any, Literal, Self, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints, model_validator
 
 from calib.geometry.rigid import Rigid, rotation_of
@@ -28,7 +27,7 @@ Words = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, ma
 
 
 class EstopBody(BaseModel):
-    """``POST /estop``: why and by whom, if they are told."""
+    """``POST /estop``: why and by whom, if they are given."""
 
     reason: str | None = None
     name: str | None = None
@@ -160,7 +159,7 @@ class SunBody(StrictBody):
     """``POST /limits/sun``: a direction by azimuth and elevation, or as a vector, and the cone around it.
 
     Azimuth goes from x over y, elevation up; in the site frame x is north and y east, in the rover's forward
-    and right. ``valid_s`` is how long it holds; left out: until another is told.
+    and right. ``valid_s`` is how long it holds; left out: until another is given.
     """
 
     azimuth_rad: Angle | None = None
@@ -222,13 +221,6 @@ class BoardBody(StrictBody):
         if self.quaternion is not None and float(np.linalg.norm(self.quaternion)) < 1e-6:
             raise ValueError(f"quaternion: {self.quaternion} where one that is not zero is expected")
         return self
-
-    @property
-    def rotation(self) -> NDArray[np.float64] | None:
-        """rover_from_board, (3, 3), where a quaternion tells it."""
-        if self.quaternion is None:
-            return None
-        return rotation_of(self.quaternion)
 
 
 class TimeBody(StrictBody):
@@ -334,7 +326,7 @@ class StrictQuery(BaseModel):
 
 
 class SnapshotQuery(StrictQuery):
-    """``GET /snapshot/{camera}``; ``frame_id`` asks for a frame that is still kept."""
+    """``GET /snapshot/{camera}``; ``frame_id`` names a frame that is still kept."""
 
     format: Literal["png", "jpeg"] = "png"
     fresh: bool = False
@@ -351,8 +343,7 @@ class EventsQuery(StrictQuery):
     def _known(self) -> Self:
         unknown = [name for name in self.names if name not in TOPICS]
         if unknown:
-            words = f"topics: {unknown[0]!r} where some of {', '.join(sorted(TOPICS))} are expected"
-            raise ValueError(words)
+            raise ValueError(f"topics: {unknown[0]!r} where some of {', '.join(sorted(TOPICS))} are expected")
         return self
 
     @property

@@ -197,17 +197,17 @@ class _Site(StaticFiles):
     def __init__(self, folder: Path) -> None:
         super().__init__(directory=folder, html=True, check_dir=False)
         self._first = folder / "index.html"
-        self.config_checked = True  # a folder that is absent is refused in words below
+        self.config_checked = True  # a folder that is absent is refused below
 
     async def get_response(self, path: str, scope: Scope) -> Response:
         try:
             return await super().get_response(path, scope)
         except HTTPException as refused:
             if refused.status_code == 404 and not self._first.is_file():
-                words = (
-                    "the documentation is not part of this installation; `tools/docs` in a checkout builds it"
-                )
-                raise NotKnown("no_docs", words) from None
+                raise NotKnown(
+                    "no_docs",
+                    "the documentation is not part of this installation; `tools/docs` in a checkout builds it",
+                ) from None
             raise
 
     def file_response(self, *args: Any, **options: Any) -> Response:

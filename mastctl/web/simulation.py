@@ -9,7 +9,7 @@ import numpy as np
 from fastapi import FastAPI, Path, Query
 
 from calib.errors import BadFile
-from calib.geometry.rigid import FloatArray, Rigid, quaternion_of
+from calib.geometry.rigid import FloatArray, Rigid, quaternion_of, rotation_of
 from calib.targets.board_file import board_of, document_of
 from drivers.faults import BOUNDS, WHEN, FaultPanel, Word
 from drivers.faults import Fault as SetFault
@@ -70,7 +70,7 @@ def add_simulation(app: FastAPI) -> None:
             printed,
             body.position_m,
             turned_rad=body.turned_rad or (0.0, 0.0, 0.0),
-            rotation=body.rotation,
+            rotation=None if body.quaternion is None else rotation_of(body.quaternion),
             bow_m=(body.bow_m[0], body.bow_m[1]) if body.bow_m is not None else None,
         )
         return _board(rover, stands)

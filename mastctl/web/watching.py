@@ -1,4 +1,4 @@
-"""Routes for who watches a daemon without using it: Prometheus, and what asks whether it is well."""
+"""Routes of the caller itself, and for programs that watch a daemon: Prometheus, health checks."""
 
 from __future__ import annotations
 
