@@ -21,7 +21,7 @@ REPORT = (
     "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'none'"
 )
-"""The Content-Security-Policy of a report: its own styles and drawings, no script, and an origin of its own."""
+"""The Content-Security-Policy of a report: its own styles and drawings, no script, its own origin."""
 PlaceName = Annotated[
     str,
     Path(

@@ -204,10 +204,8 @@ class _Site(StaticFiles):
             return await super().get_response(path, scope)
         except HTTPException as refused:
             if refused.status_code == 404 and not self._first.is_file():
-                raise NotKnown(
-                    "no_docs",
-                    "the documentation is not part of this installation; `tools/docs` in a checkout builds it",
-                ) from None
+                message = "this installation has no documentation; `tools/docs` in a checkout builds it"
+                raise NotKnown("no_docs", message) from None
             raise
 
     def file_response(self, *args: Any, **options: Any) -> Response:
