@@ -100,12 +100,10 @@ def _show(args: argparse.Namespace) -> Answer:
     option("--surface SURFACE", "infinity, sphere:METRES, ground or ground:Z", default="ground"),
     option("--px-per-deg PX", "resolution (default: the lens' own in its middle)"),
     option("--raw", "leave the pictures' brightness as it is"),
-    option("--mast OTHER.yaml", "evaluate the angles as read by this mast file"),
     help="compose the mosaic anew and measure its seams",
     example="panorama --surface infinity",
 )
 def _compose(args: argparse.Namespace) -> Answer:
-    from calib.files.mast_file import load_rig
     from calib.geometry.mosaic import MosaicSurface
     from mastctl.panorama.compose import Composition, compose
     from mastctl.panorama.folder import Folder
@@ -113,7 +111,7 @@ def _compose(args: argparse.Namespace) -> Answer:
     scale = None if args.px_per_deg is None else math.degrees(args.px_per_deg)
     wanted = Composition(args.projection, args.frame, MosaicSurface.of(args.surface), scale, args.raw)
     folder = Folder(args.folder)
-    compose(folder, wanted, None if args.mast is None else load_rig(args.mast).rig)
+    compose(folder, wanted)
     return Answer(_document(folder.index), _shown(args.folder, folder.index))
 
 

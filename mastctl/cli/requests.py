@@ -203,6 +203,18 @@ REQUESTS = (
         keys=TRACK,
     ),
     Request(
+        "panorama list",
+        "list a daemon's panoramas, the newest first",
+        lambda client, _: {"panoramas": client.panoramas()},
+    ),
+    Request(
+        "panorama delete",
+        "delete a panorama of a daemon with its pictures",
+        lambda client, args: {"panoramas": client.delete_panorama(args.id)},
+        (option("ID", "as 'mastctl panorama list' shows it", dest="id"),),
+        "20260101-120000-1a2b",
+    ),
+    Request(
         "panorama forget",
         "forget a target",
         lambda client, args: {"targets": client.forget_target(args.name)},

@@ -108,10 +108,14 @@ def _check_target(args: argparse.Namespace) -> None:
 def _target(args: argparse.Namespace, client: Client) -> dict[str, Any]:
     """The target as `Client.point` and `Client.start_track` take it; empty if the options name none."""
     if getattr(args, "panorama", None) is not None:
+        from mastctl.panorama.compose import picture_at
         from mastctl.panorama.folder import Folder
 
         x, y = _pixel("--pixel", args.pixel)
-        target = {"id": Folder(args.panorama).index.id, "x_px": x, "y_px": y}
+        folder = Folder(args.panorama)
+        seen = picture_at(folder, (x, y))  # by this folder's mosaic; the daemon's own may be another
+        x, y = seen.pixel_px.tolist()
+        target = {"id": folder.index.id, "view": seen.view, "x_px": x, "y_px": y}
         given = {name: True for name in ("recompute", "by_direction") if getattr(args, name)}
         return {"panorama": target | given}
     if args.pixel is not None:

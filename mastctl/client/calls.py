@@ -231,6 +231,10 @@ class Calls:
         """Return a panorama's index (``mastctl/panorama/1``)."""
         return self.daemon.json(dict[str, Any], "GET", f"/panoramas/{escaped(name)}")
 
+    def delete_panorama(self, name: str) -> list[answers.PanoramaListed]:
+        """Delete a panorama with its pictures and return those that are left."""
+        return self.daemon.command(answers.PanoramaList, "DELETE", f"/panoramas/{escaped(name)}")["panoramas"]
+
     def panorama_file(self, name: str, file: str) -> bytes:
         """Return a file of a panorama: ``index.yaml``, ``mosaic.png``, a frame that the index names."""
         return self.daemon.request("GET", f"/panoramas/{escaped(name)}/files/{file}").content

@@ -80,6 +80,7 @@ PLACE_FORGET = Command("place.forget")
 TARGET_KEEP = Command("target.keep")
 TARGET_FORGET = Command("target.forget")
 PANORAMA = Command("panorama", steers=True, need="motion")
+PANORAMA_DELETE = Command("panorama.delete", "admin")
 BENCH = Command("bench", steers=True, need="track")
 BENCH_STANDS = Command("bench.stands")  # a fact about the board
 BENCH_LEAVE = Command("bench.leave")

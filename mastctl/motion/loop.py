@@ -120,11 +120,11 @@ class PointingLoop(Steps):
         return self._previewed(found.now, found.pixel_px, about, aim)
 
     def preview_kept(
-        self, request: PointRequest, frames: Sequence[StampedFrame], pixel_px: FloatArray, point_m: FloatArray
+        self, request: PointRequest, frames: Sequence[StampedFrame], pixel_px: FloatArray, range_m: float
     ) -> Preview:
         """Return the same of a pixel of a kept picture, with the partner's of that moment, if there is one.
 
-        ``point_m`` (3,): where the thing lies if nothing measures it. Raises as `preview`.
+        ``range_m``: how far the thing is if nothing measures it. Raises as `preview`.
         """
         now, *others = (self.cameras.view(frame) for frame in frames)
         aim, about = aim_of(request, self._rig), {}
@@ -133,8 +133,8 @@ class PointingLoop(Steps):
             point = self._triangulate(now, pixel_px, others[0], partnered.match)
             about = _stereo_facts(now, pixel_px, others[0], partnered, point)
         else:
-            self._position_m = point_m
-            range_m = float(np.linalg.norm(point_m - now.camera.C))
+            ray = now.camera.ray(pixel_px)
+            self._position_m = ray.origins_m + range_m * ray.directions
             about = {"range_m": range_m, "range_from": "surface"}
         return self._previewed(now, pixel_px, about, aim)
 

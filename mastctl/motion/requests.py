@@ -73,7 +73,7 @@ class PixelTarget:
 
 @dataclass(frozen=True, config=CHECKED)
 class PanoramaTarget:
-    """What a pixel of a panorama shows.
+    """What a pixel of a panorama's mosaic shows, or with ``view`` one of that view's picture.
 
     ``recompute``: evaluate a panorama of another mast file through its angles as read; ``by_direction``:
     point where the panorama's surface puts it, with nothing found again in a picture.
@@ -82,6 +82,7 @@ class PanoramaTarget:
     id: Name
     x_px: Pixel
     y_px: Pixel
+    view: Annotated[int, Field(strict=True, ge=0)] | None = None
     recompute: bool = False
     by_direction: bool = False
 

@@ -13,7 +13,6 @@ import numpy as np
 from calib.errors import BadFile
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.mosaic import Canvas, MosaicSurface, Projection, border, canvas_of
-from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
 from calib.matching.mosaic import Picture, SeamError, Slip, composed, frames_of, gains_of, seams_of, slip_of
 from mastctl.answers import PanoramaDrawn
@@ -48,31 +47,26 @@ class Composition:
 SO_FAR = Composition(px_per_rad=300.0)
 
 
-def canvas_for(folder: Folder, wanted: Composition, rig: Rig | None = None) -> Canvas:
+def canvas_for(folder: Folder, wanted: Composition) -> Canvas:
     """Return the canvas of the views that were taken. Raises CalibError."""
-    mast = (rig or folder.mast.rig).mast
-    origin = mast.rover_from_mast
+    origin = folder.mast.rig.mast.rover_from_mast
     if wanted.frame == "rover":
         origin = Rigid(np.eye(3), origin.translation_m)
-    return canvas_of(folder.cameras(rig), origin, wanted.surface, wanted.projection, wanted.px_per_rad)
+    return canvas_of(folder.cameras(), origin, wanted.surface, wanted.projection, wanted.px_per_rad)
 
 
-def compose(folder: Folder, wanted: Composition, rig: Rig | None = None) -> Picture:
-    """Write the mosaic, the preview and the seams' errors into a folder, and return the mosaic.
-
-    ``rig``: another mast file's, with which the angles as read are evaluated. Raises BadFile, CalibError.
-    """
+def compose(folder: Folder, wanted: Composition) -> None:
+    """Write the mosaic, the preview and the seams' errors into a folder. Raises BadFile, CalibError."""
     index = folder.index
     if not index.taken():
         raise BadFile(folder.path, "views", "none was taken, so there is no mosaic")
-    cameras, pictures = folder.cameras(rig), folder.pictures()
-    canvas = canvas_for(folder, wanted, rig)
+    cameras, pictures, canvas = folder.cameras(), folder.pictures(), canvas_for(folder, wanted)
     owners, places = frames_of(canvas, cameras)
     gains = None if wanted.raw else gains_of(canvas, cameras, pictures)
     mosaic = composed(pictures, owners, places, gains)
     del owners, places
-    seams, by, camera = seams_of(canvas, cameras, pictures), rig or folder.mast.rig, index.cameras[0]
-    slip = slip_of(by, camera, folder.angles_rad(rig), canvas, seams.patches)
+    seams = seams_of(canvas, cameras, pictures)
+    slip = slip_of(folder.mast.rig, index.cameras[0], folder.angles_rad(), canvas, seams.patches)
     write_picture(folder.path / MOSAIC, mosaic, {cv2.IMWRITE_PNG_COMPRESSION: 1})
     write_picture(folder.path / PREVIEW, reduced(mosaic), JPEG)
     numbers = [number for number, _ in index.taken()]
@@ -88,7 +82,6 @@ def compose(folder: Folder, wanted: Composition, rig: Rig | None = None) -> Pict
             }
         )
     )
-    return mosaic
 
 
 def so_far(folder: Folder) -> bytes:
@@ -107,38 +100,37 @@ def reduced(mosaic: Picture) -> Picture:
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """The picture behind a mosaic's pixel: its view, the pixel (2,) in it, and the surface's point (3,)."""
+    """A pixel (2,) of a view's picture, and how far from its camera the mosaic's surface lies there."""
 
     view: int
     pixel_px: FloatArray
-    point_m: FloatArray
+    range_m: float
 
 
-def picture_at(folder: Folder, pixel_px: tuple[float, float], rig: Rig | None = None) -> Seen:
+def picture_at(folder: Folder, pixel_px: tuple[float, float], view: int | None = None) -> Seen:
     """Return which picture a mosaic's pixel is of, and where: by the map that drew it.
 
-    Raises BadRequest ``no_mosaic``, ``outside_panorama``.
+    ``view``: the pixel is one of that view's picture. Raises BadRequest ``no_mosaic``, ``outside_panorama``.
     """
-    record = folder.index.mosaic
-    if record is None:
-        raise BadRequest("no_mosaic", f"panorama {folder.index.id} is not composed yet")
-    canvas, pixel = record.canvas, np.array(pixel_px)
-    best: tuple[float, Seen] | None = None
-    for (number, _), camera in zip(folder.index.taken(), folder.cameras(rig), strict=True):
-        found, seen = canvas.in_camera(camera, pixel)
-        if not bool(seen) or not camera.holds(found):
-            continue
-        far = float(np.linalg.norm(found - np.array(camera.image_center_px)))
-        if best is None or far < best[0]:
-            best = far, Seen(number, np.asarray(found), canvas.points(pixel))
+    index, record, pixel = folder.index, folder.index.mosaic, np.array(pixel_px)
+    if record is None and view is None:
+        raise BadRequest("no_mosaic", f"panorama {index.id} is not composed yet")
+    canvas = canvas_for(folder, SO_FAR) if record is None else record.canvas
+    best: tuple[float, int, FloatArray, CameraModel] | None = None
+    for (number, _), camera in zip(index.taken(), folder.cameras(), strict=True):
+        place, seen = (pixel, number == view) if view is not None else canvas.in_camera(camera, pixel)
+        if bool(seen) and camera.holds(place):
+            far = float(np.linalg.norm(place - np.array(camera.image_center_px)))
+            if best is None or far < best[0]:
+                best = far, number, np.asarray(place), camera
     if best is None:
         width, height = canvas.size_px
-        place = f"({pixel_px[0]:g}, {pixel_px[1]:g})"
-        raise BadRequest(
-            "outside_panorama",
-            f"pixel {place} of {width}x{height} px of panorama {folder.index.id} shows no view",
-        )
-    return best[1]
+        image = f"the mosaic of {width}x{height} px" if view is None else f"view {view}"
+        at = f"({pixel_px[0]:g}, {pixel_px[1]:g})"
+        raise BadRequest("outside_panorama", f"pixel {at} of {image} of panorama {index.id} shows no view")
+    _, number, found, camera = best
+    point = canvas.points(canvas.of_camera(camera, found))
+    return Seen(number, found, float(np.linalg.norm(point - camera.ray(found).origins_m)))
 
 
 def _seam(views: list[int], error: SeamError) -> SeamRecord:
@@ -172,10 +164,7 @@ def drawn(folder: Folder, now: CameraModel | None, points_m: Mapping[str, FloatA
         seen = [(one, place) for one in folder.cameras() if one.holds(place := one.project(point)[0])]
         if seen:
             camera, place = min(seen, key=lambda one: float(np.linalg.norm(one[1] - one[0].image_center_px)))
-            targets[name] = canvas.of_camera(camera, place).tolist()
+            at = canvas.of_camera(camera, place)
+            if np.isfinite(at).all():
+                targets[name] = at.tolist()
     return {"size_px": list(canvas.size_px), "view_px": view, "targets_px": targets}
-
-
-def degrees_of(px_per_rad: float) -> float:
-    """Return pixels per degree."""
-    return px_per_rad * math.pi / 180.0

@@ -28,7 +28,6 @@ from calib.files.records import ABSENT, Moment, Number, Pair, Record, Text, Vect
 from calib.files.yaml_text import dump_mapping
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.mosaic import Canvas, MosaicSurface, Projection
-from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid
 from calib.matching.mosaic import Picture
 from mastctl.as_json import as_json
@@ -45,7 +44,7 @@ Count = Annotated[int, Field(ge=0, le=1_000_000)]
 class FrameRecord(Record):
     """A picture of a view: its file, the SHA-256 of that, and the facts of a snapshot's headers."""
 
-    file: Text
+    file: Annotated[str, Field(pattern=r"^frames/[^/]+\.png$")]
     sha256: Text
     frame_id: Text
     sequence: Count
@@ -78,7 +77,7 @@ class MosaicRecord(Record):
     projection: Projection
     frame: Literal["mast", "rover"]
     surface: Text
-    px_per_rad: Number
+    px_per_rad: Annotated[Number, Field(gt=0)]
     azimuth_rad: Number
     elevation_rad: Number
     size_px: Annotated[list[Count], Field(min_length=2, max_length=2)]
@@ -226,23 +225,15 @@ class Folder:
         facts = {name: value for name, value in record.model_dump().items() if name in names}
         return StampedFrame(**facts, camera=camera, moving=False, image=image)
 
-    def angles_rad(self, rig: Rig | None = None) -> list[tuple[float, float]]:
-        """Return true (pan, tilt) of each view that was taken; by another ``rig`` from the angles as read."""
-        found = []
-        for _, view in self.index.taken():
-            frame = view.frames[self.index.cameras[0]]
-            if rig is None:
-                found.append((frame.true_pan_rad, frame.true_tilt_rad))
-            else:
-                read, came = (frame.pan_rad, frame.tilt_rad), (frame.pan_approach, frame.tilt_approach)
-                found.append(rig.joints.true_rad(read, came))
-        return found
+    def angles_rad(self) -> list[tuple[float, float]]:
+        """Return true (pan, tilt) of each view that was taken."""
+        frames = [view.frames[self.index.cameras[0]] for _, view in self.index.taken()]
+        return [(frame.true_pan_rad, frame.true_tilt_rad) for frame in frames]
 
-    def cameras(self, rig: Rig | None = None) -> list[CameraModel]:
+    def cameras(self) -> list[CameraModel]:
         """Return the mosaic's camera at each view that was taken, in the rover frame."""
         name = self.index.cameras[0]
-        by = rig or self.mast.rig
-        return [by.camera_in_rover(name, *angles) for angles in self.angles_rad(rig)]
+        return [self.mast.rig.camera_in_rover(name, *angles) for angles in self.angles_rad()]
 
     def pictures(self) -> list[Picture]:
         """Return the pictures of the mosaic's camera. Raises BadFile."""

@@ -1,8 +1,9 @@
-"""The panoramas of a daemon: begun, gone on with, listed, and clicked."""
+"""The panoramas of a daemon: begun, gone on with, listed, clicked, and deleted."""
 
 from __future__ import annotations
 
 import secrets
+import shutil
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
@@ -11,7 +12,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Protocol
 
-from calib.errors import BadFile
+from calib.errors import BadFile, CalibError
+from calib.files import is_plain_file
 from calib.files.mast_file import StoredRig
 from calib.geometry.rig import Rig
 from drivers.clock import Clock
@@ -30,6 +32,8 @@ FOLDER = "panoramas"
 HOLDER = "panoramas"
 KEPT = 8
 """Frames of panoramas that were clicked last stay at hand."""
+MOST = 100
+"""So many panoramas are kept; the next is refused until one is deleted."""
 
 
 class MastLike(Protocol):
@@ -68,33 +72,42 @@ class Panoramas:
         """Start to take a panorama, or what an earlier one lacks (``resume``); return the first record.
 
         Raises NotKnown, BadRequest, NotNow if camera or field do not fit the rig, or it is of another mast
-        file, Unable if the disk refuses; else as `mastctl.control.operations.OperationRunner.start`.
+        file, Unable if the disk refuses; else as `mastctl.control.operations.OperationRunner.start`. Nothing
+        is left of one that is refused.
         """
         with self._unchanged() as mast:
-            rig = self._rig()
-            if body.resume is not None:
-                folder = Folder(self.open(body.resume).path)
-                self._check_mast(folder, mast)
-            else:
-                index = self._planned(rig, body, mast.stored.digest)
-                try:
-                    folder = Folder.begin(self._folder / index.id, index, mast.data)
-                except BadFile as error:
-                    raise Unable("unwritable", str(error)) from None
-            folder.save(folder.index.model_copy(update={"state": "running", "reason": ""}))
-            limits = self._devices.judge.limits
-
-            def run(record: Callable[[Any], None], cancelled: threading.Event) -> Any:
-                parts = rig, self._devices, limits, self._clock, PointingSettings(), record, cancelled
-                result = PanoramaTaker(*parts).take(folder, self._devices)
-                self._newest = folder.index
-                return result
-
+            rig, limits = self._rig(), self._devices.judge.limits
+        if body.resume is not None:
+            folder = Folder(self.open(body.resume).path)
+            self._check_mast(folder, mast)
+            for name in folder.index.cameras:
+                check_known(name, rig.cameras)
+        else:
+            index = self._planned(rig, body, mast.stored.digest)
+            if sum(1 for _ in self._folder.glob(f"*/{INDEX}")) >= MOST:
+                message = f"{MOST} panoramas are kept already; delete one of them first"
+                raise BadRequest("too_many_panoramas", message)
             try:
+                folder = Folder.begin(self._folder / index.id, index, mast.data)
+            except BadFile as error:
+                shutil.rmtree(self._folder / index.id, ignore_errors=True)
+                raise Unable("unwritable", str(error)) from None
+
+        def run(record: Callable[[Any], None], cancelled: threading.Event) -> Any:
+            parts = rig, self._devices, limits, self._clock, PointingSettings(), record, cancelled
+            result = PanoramaTaker(*parts).take(folder, self._devices)
+            self._newest = folder.index
+            return result
+
+        try:
+            with self._unchanged() as now:
+                if now is not mast:
+                    raise NotNow("other_mast_file", "another mast file came into use meanwhile; try again")
                 return self._operations.start({**recorded, "panorama": folder.index.id}, run)
-            except Exception as error:
-                folder.save(folder.index.model_copy(update={"state": "ended", "reason": str(error)}))
-                raise
+        except BaseException:
+            if body.resume is None:
+                shutil.rmtree(folder.path, ignore_errors=True)
+            raise
 
     def _planned(self, rig: Rig, body: Any, digest: str) -> Index:
         """The index of a panorama without views, as a request wants it."""
@@ -149,21 +162,50 @@ class Panoramas:
     def open(self, name: str) -> Folder:
         """Return one by its id. Raises NotKnown ``panorama_unknown``, Unable ``unreadable``."""
         path = self._folder / name
-        if "/" in name or name.startswith(".") or not (path / INDEX).is_file():
+        if "/" in name or name.startswith(".") or not is_plain_file(path / INDEX):
             raise NotKnown("panorama_unknown", f"this daemon has no panorama {name[:80]}")
         try:
             mark = (path / INDEX).stat().st_mtime_ns
             known = self._known.get(name)
             if known is None or known[0] != mark:
                 known = self._known[name] = mark, Folder(path)
-            return known[1]
+            folder = known[1]
+            if folder.index.state == "running" and not self._runs(name):
+                ended = {
+                    "state": "ended",
+                    "reason": "its end was not written: the daemon ended first, or the disk was full",
+                }
+                folder.index = folder.index.model_copy(update=ended)
+            return folder
         except (BadFile, OSError) as error:
             raise Unable("unreadable", str(error)) from None
+
+    def _runs(self, name: str) -> bool:
+        """Whether a panorama is being taken."""
+        running = self._operations.running
+        return running is not None and self._operations.get(running).request.get("panorama") == name
+
+    def delete(self, name: str) -> PanoramaList:
+        """Delete one, its pictures too, and return all that are left.
+
+        Raises NotKnown ``panorama_unknown``, NotNow ``busy`` while it is taken, Unable ``not_deleted``.
+        """
+        path = self._folder / name
+        if "/" in name or name.startswith(".") or not path.is_dir():
+            raise NotKnown("panorama_unknown", f"this daemon has no panorama {name[:80]}")
+        if self._runs(name):
+            raise NotNow("busy", f"panorama {name} is being taken; stop it first")
+        try:
+            shutil.rmtree(path)
+        except OSError as error:
+            raise Unable("not_deleted", f"{error.filename}: {error.strerror}") from None
+        self._known.pop(name, None)
+        return self.listed()
 
     def file(self, name: str, file: str) -> Path:
         """Return a file of one. Raises NotKnown ``panorama_unknown``."""
         path = self.open(name).path / file
-        if ".." in Path(file).parts or Path(file).is_absolute() or not path.is_file():
+        if ".." in Path(file).parts or Path(file).is_absolute() or not is_plain_file(path):
             raise NotKnown("panorama_unknown", f"panorama {name} has no file {file[:80]}")
         return path
 
@@ -173,61 +215,57 @@ class Panoramas:
         count = len(folder.index.taken())
         if not count:
             raise NotNow("no_views", f"panorama {name} has no view yet")
-        if self._so_far is None or self._so_far[:2] != (name, count):
-            self._so_far = name, count, so_far(folder)
-        return self._so_far[2]
+        drawn = self._so_far
+        if drawn is None or drawn[:2] != (name, count):
+            try:
+                drawn = self._so_far = name, count, so_far(folder)
+            except CalibError as error:
+                raise Unable("unreadable", str(error)) from None
+        return drawn[2]
 
     def camera_of(self, target: PanoramaTarget | None) -> str:
         """Return the camera that a panorama's mosaic is of. Raises NotKnown, Unable."""
         return self.open("" if target is None else target.id).index.cameras[0]
 
+    def seen(self, target: PanoramaTarget) -> tuple[Seen, list[StampedFrame]]:
+        """Return what a pixel shows, and its view's pictures, of the mosaic's camera first; reads the disk.
+
+        The pictures are as if the mast file in use had been in use then, of cameras that are configured.
+        Raises BadRequest, NotKnown, NotNow, Unable ``unreadable``.
+        """
+        folder = self.open(target.id)
+        with self._unchanged() as mast:
+            rig = self._rig()
+        if not target.recompute:
+            self._check_mast(folder, mast)
+        check_known(folder.index.cameras[0], rig.cameras)
+        seen = picture_at(folder, (target.x_px, target.y_px), target.view)
+        frames = []
+        for name in folder.index.cameras:
+            if name in rig.cameras:
+                try:
+                    frame = folder.frame(seen.view, name)
+                except BadFile as error:
+                    raise Unable("unreadable", str(error)) from None
+                frames.append(_recomputed(frame, rig, mast.stored.digest) if target.recompute else frame)
+        return seen, frames
+
     def pointed(
-        self, request: PointRequest, mast: MastLike
+        self, request: PointRequest, seen: Seen, frame: StampedFrame
     ) -> tuple[PointRequest, tuple[float, float] | None]:
         """Return a request at a panorama's pixel as one at its picture's, and the true angles of that view.
 
-        By direction alone it becomes a position, without angles. Raises BadRequest, NotKnown, NotNow.
+        ``seen`` and ``frame`` are of `seen`. By direction alone it becomes a position, without angles.
         """
-        target = request.panorama
-        assert target is not None
-        folder, seen = self._seen(target, mast)
-        if target.by_direction:
-            position = [float(one) for one in seen.point_m]
+        assert request.panorama is not None
+        if request.panorama.by_direction:
+            ray = self._rig().camera_in_rover(frame.camera, *frame.true_rad).ray(seen.pixel_px)
+            position = (ray.origins_m + seen.range_m * ray.directions).tolist()
             return request.model_copy(update={"panorama": None, "position_m": position}), None
-        frame = self._frame(folder, seen.view, folder.index.cameras[0], target, mast)
         self._devices.hold(frame, HOLDER, KEPT)
-        x, y = (float(one) for one in seen.pixel_px)
-        pixel = PixelTarget(frame.camera, frame.frame_id, x, y)
+        x, y = seen.pixel_px.tolist()
+        pixel = PixelTarget(frame.camera, frame.frame_id, x, y, frame.mast_digest)
         return request.model_copy(update={"panorama": None, "pixel": pixel}), frame.true_rad
-
-    def kept_views(self, target: PanoramaTarget, mast: MastLike) -> tuple[Seen, list[StampedFrame]]:
-        """Return what a pixel shows, and the pictures of its view, of the mosaic's camera first."""
-        folder, seen = self._seen(target, mast)
-        return seen, [self._frame(folder, seen.view, name, target, mast) for name in folder.index.cameras]
-
-    def _seen(self, target: PanoramaTarget, mast: MastLike) -> tuple[Folder, Seen]:
-        folder = self.open(target.id)
-        if not target.recompute:
-            self._check_mast(folder, mast)
-        check_known(folder.index.cameras[0], self._rig().cameras)
-        rig = self._rig() if target.recompute else None
-        return folder, picture_at(folder, (target.x_px, target.y_px), rig)
-
-    def _frame(
-        self, folder: Folder, view: int, camera: str, target: PanoramaTarget, mast: MastLike
-    ) -> StampedFrame:
-        """A view's picture as if the mast file in use had been in use then."""
-        try:
-            frame = folder.frame(view, camera)
-        except BadFile as error:
-            raise Unable("unreadable", str(error)) from None
-        if not target.recompute:
-            return frame
-        came = frame.pan_approach, frame.tilt_approach
-        pan, tilt = self._rig().joints.true_rad((frame.pan_rad, frame.tilt_rad), came)
-        digest = mast.stored.digest
-        name = f"{frame.frame_id}-{digest[:8]}"
-        return replace(frame, frame_id=name, mast_digest=digest, true_pan_rad=pan, true_tilt_rad=tilt)
 
     def _check_mast(self, folder: Folder, mast: MastLike) -> None:
         """Refuse a panorama of another mast file. Raises NotNow ``other_mast_file``."""
@@ -238,6 +276,14 @@ class Panoramas:
                 f"panorama {folder.index.id} was taken with mast file {taken_with:.8}..., the one in use is "
                 f"{in_use:.8}...; recompute evaluates its angles as read by this one",
             )
+
+
+def _recomputed(frame: StampedFrame, rig: Rig, digest: str) -> StampedFrame:
+    """A picture with the true angles that another mast file makes of those that were read."""
+    came = frame.pan_approach, frame.tilt_approach
+    pan, tilt = rig.joints.true_rad((frame.pan_rad, frame.tilt_rad), came)
+    name = f"{frame.frame_id}-{digest[:8]}"
+    return replace(frame, frame_id=name, mast_digest=digest, true_pan_rad=pan, true_tilt_rad=tilt)
 
 
 def _widest(rig: Rig) -> str:

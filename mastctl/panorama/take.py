@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -80,16 +80,20 @@ def _covered(rig: Rig, camera: str, tilt_rad: float) -> tuple[float, float, floa
 
 
 class PanoramaTaker(Steps):
-    """Takes the views of a panorama that are still wanted. Parameters of `Steps`."""
+    """Takes the views of a panorama that it lacks. Parameters of `Steps`."""
+
+    _fixed = False
 
     def take(self, folder: Folder, devices: Devices) -> PanoramaResult:
         """Take, keep and compose; the folder has all that was taken, whatever happens.
 
         Raises PointingError ``stopped``, the error of three views in a row, BadFile if the disk refuses.
         """
-        wanted = [at for at, view in enumerate(folder.index.views) if view.state in ("wanted", "missing")]
         failed = 0
         try:
+            folder.save(folder.index.model_copy(update={"state": "running", "reason": ""}))
+            self._check_pictures(folder)
+            wanted = [at for at, view in enumerate(folder.index.views) if view.state != "taken"]
             with ExitStack() as fixed:
                 for number in wanted:
                     ended = self._view(folder, number, fixed.enter_context, devices)
@@ -102,10 +106,12 @@ class PanoramaTaker(Steps):
                 detail.update(seams=None if whole is None else whole.model_dump())
                 detail.update(slip=None if slip is None else slip.sentence)
         except BaseException as error:
-            self._ended(folder, "ended", " ".join(str(error).split()) or type(error).__name__)
             devices.stop()
+            end = {"state": "ended", "reason": " ".join(str(error).split()) or type(error).__name__}
+            with suppress(BadFile):  # of a full disk; the error says so already
+                folder.save(folder.index.model_copy(update=end))
             raise
-        self._ended(folder, "done", "")
+        folder.save(folder.index.model_copy(update={"state": "done"}))
         states = [view.state for view in folder.index.views]
         return PanoramaResult(folder.index.id, {state: states.count(state) for state in sorted(set(states))})
 
@@ -138,13 +144,14 @@ class PanoramaTaker(Steps):
         self, folder: Folder, number: int, view: ViewRecord, fix: Callable[[Any], Any], devices: Devices
     ) -> ViewRecord:
         """Go to a view, take its pictures at rest, and write them."""
-        cameras, first = folder.index.cameras, not folder.index.taken()
+        cameras = folder.index.cameras
         with self.whole("view") as detail:
             detail.update(view=number, of=len(folder.index.views))
             self.before(cameras, (view.pan_rad, view.tilt_rad))
             _, settled = self.go_to_true(view.pan_rad, view.tilt_rad)
             views = self.capture(cameras, settled)
-            if self._fixes(folder) and first:  # from what the automatic made of the first view
+            if folder.index.exposure == "first" and not self._fixed:
+                self._fixed = True  # from what the automatic made of the first view
                 fix(devices.exposure_held())
                 views = self.capture(cameras, self.rest())
             frames = {name: folder.keep(number, name, one.frame) for name, one in views.items()}
@@ -154,12 +161,14 @@ class PanoramaTaker(Steps):
         )
 
     @staticmethod
-    def _fixes(folder: Folder) -> bool:
-        return folder.index.exposure == "first"
-
-    @staticmethod
-    def _ended(folder: Folder, state: str, reason: str) -> None:
-        folder.save(folder.index.model_copy(update={"state": state, "reason": reason}))
+    def _check_pictures(folder: Folder) -> None:
+        """Have views taken again of which a picture is damaged."""
+        for number, view in folder.index.taken():
+            try:
+                for frame in view.frames.values():
+                    folder.picture(frame)
+            except BadFile as error:
+                folder.save(folder.index.with_view(number, _with(view, "missing", str(error))))
 
 
 def _with(view: ViewRecord, state: str, reason: str) -> ViewRecord:

@@ -13,7 +13,7 @@ from drivers.clock import Clock
 from mastctl.answers import Preview
 from mastctl.control.operations import Operation, OperationRunner
 from mastctl.devices.devices import Devices
-from mastctl.devices.frames import check_known
+from mastctl.devices.frames import StampedFrame, check_known
 from mastctl.devices.judge import Limits
 from mastctl.errors import NotNow
 from mastctl.motion.loop import PointingLoop
@@ -92,13 +92,14 @@ class Steering:
         NotNow if the frame is of another mast file, head or rover moved since, or as
         `mastctl.control.operations.OperationRunner.start`.
         """
+        clicked = None if request.panorama is None else self._panoramas.seen(request.panorama)
         with self._masts.unchanged() as mast:
             view_rad = None
-            if request.panorama is not None:
-                request, view_rad = self._panoramas.pointed(request, mast)
+            if clicked is not None:
+                request, view_rad = self._panoramas.pointed(request, clicked[0], clicked[1][0])
                 recorded = recorded if request.pixel is None else {**recorded, "pixel": request.pixel}
             request = self._in_rover(request)
-            self._check(request, None if view_rad else CLICK_AGE_S)
+            self._check(request, clicked is not None)
             loop = self._loop()
 
             def run(record: Callable[[Any], None], cancelled: threading.Event) -> Any:
@@ -112,16 +113,20 @@ class Steering:
 
         Raises as `point` and `mastctl.motion.loop.PointingLoop.preview`.
         """
-        with self._masts.unchanged() as mast:
-            target = request.panorama
-            if target is not None:
-                seen, frames = self._panoramas.kept_views(target, mast)
-                request, _ = self._panoramas.pointed(request, mast)
-            self._check(request, CLICK_AGE_S if target is None else None)
-            loop = self._loop()(lambda step: None, cancelled)
+        target = request.panorama
         if target is not None:
-            return loop.preview_kept(request, frames, seen.pixel_px, seen.point_m)
-        return loop.preview(request)
+            seen, frames = self._panoramas.seen(target)
+            self._check_rover_stands(frames[0])
+        with self._masts.unchanged():
+            if target is not None:
+                request, _ = self._panoramas.pointed(request, seen, frames[0])
+            self._check(request, target is not None)
+            loop = self._loop()(lambda step: None, cancelled)
+        if target is None:
+            return loop.preview(request)
+        return loop.preview_kept(
+            request, frames[:1] if target.by_direction else frames, seen.pixel_px, seen.range_m
+        )
 
     def start_track(self, request: TrackRequest, recorded: Mapping[str, Any]) -> Operation:
         """Begin to follow what a pixel shows, or what is seen at a position; return the start's record.
@@ -133,6 +138,7 @@ class Steering:
             if request.pixel is not None:
                 check_known(request.pixel.camera, self.rig.cameras)
                 check_pair(request.pixel.camera, self.rig, self._masts.in_use.stored.rig)
+                self._check_digest(request.pixel)
                 self._check_pixel(request.pixel)
             return self._tracker.start(request, recorded)
 
@@ -173,27 +179,34 @@ class Steering:
         pose = self._tracker.pose
         return request if pose is None else request.in_rover(pose.site_from_rover)
 
-    def _check(self, request: PointRequest, max_age_s: float | None = CLICK_AGE_S) -> None:
-        """Refuse a request that does not fit the mast file in use; see `point`. None: of a panorama."""
-        if request.pixel is not None and max_age_s is not None:
-            self._check_pixel(request.pixel)
+    def _check(self, request: PointRequest, of_panorama: bool) -> None:
+        """Refuse a request that does not fit the mast file in use; see `point`."""
+        if request.pixel is not None:
+            self._check_digest(request.pixel)
+            if not of_panorama:
+                self._check_pixel(request.pixel)
         if request.angles_rad is not None:
             self._devices.judge.check_goal(*request.angles_rad)
         if request.aim is not None:
             aim_of(request, self.rig)
 
-    def _check_pixel(self, target: PixelTarget) -> None:
-        stored = self._masts.in_use.stored
-        taken_with, in_use = target.mast_digest, stored.digest
+    def _check_digest(self, target: PixelTarget) -> None:
+        taken_with, in_use = target.mast_digest, self._masts.in_use.stored.digest
         if taken_with not in (None, in_use):
             message = (
                 f"the pixel was taken with mast file {taken_with:.8}..., the one in use is {in_use:.8}..."
             )
             raise NotNow("other_mast_file", message)
+
+    def _check_pixel(self, target: PixelTarget) -> None:
         find = partial(self._devices.frame_by_id, max_age_s=CLICK_AGE_S)
         frame = clicked_frame(target, self.rig, find)
         self._devices.hold(frame)  # until it has been found again, however many images are watched
+        self._check_rover_stands(frame)
+
+    def _check_rover_stands(self, frame: StampedFrame) -> None:
+        """Refuse an image of another place of the rover. Raises NotNow ``rover_moved``."""
         moved_s = self._tracker.moved_s
         if moved_s is not None and frame.exposure_began_s < moved_s:
-            message = f"the rover moved since this image of {target.camera} was exposed; take another"
+            message = f"the rover moved since this image of {frame.camera} was exposed; take another"
             raise NotNow("rover_moved", message)

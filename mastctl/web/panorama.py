@@ -8,7 +8,7 @@ from fastapi import FastAPI, Path, Request
 from fastapi.responses import FileResponse, Response
 
 from mastctl.answers import PanoramaDrawn, PanoramaList, Started, TargetList
-from mastctl.control.entry import PANORAMA, TARGET_FORGET, TARGET_KEEP
+from mastctl.control.entry import PANORAMA, PANORAMA_DELETE, TARGET_FORGET, TARGET_KEEP
 from mastctl.http import PREFIX
 from mastctl.panorama.folder import Index
 from mastctl.service.steering import usual_s
@@ -22,7 +22,7 @@ WAY_S = 60.0
 
 
 def add_panoramas(app: FastAPI) -> None:
-    """Panoramas begun, listed and read."""
+    """Panoramas begun, listed, read and deleted."""
 
     @command(
         app,
@@ -46,6 +46,11 @@ def add_panoramas(app: FastAPI) -> None:
     )
     async def about(name: Panorama, here: Here) -> Index:
         return await here.waiting.run(lambda: here.service.panoramas.open(name).index)
+
+    @command(app, "DELETE /panoramas/{name}", PANORAMA_DELETE)
+    def delete(name: Panorama, here: Here) -> PanoramaList:
+        """Delete a panorama with its pictures."""
+        return here.service.panoramas.delete(name)
 
     @app.get(
         f"{PREFIX}/panoramas/{{name}}/picture",

@@ -65,7 +65,10 @@ def add_pointing(app: FastAPI) -> None:
             raise BadRequest(
                 "bad_request", "pixel is missing; a preview is of a named frame's or a panorama's"
             )
-        camera = service.panoramas.camera_of(body.panorama) if body.pixel is None else body.pixel.camera
+        if body.pixel is not None:
+            camera = body.pixel.camera
+        else:  # the disk is read
+            camera = await here.waiting.run(lambda: service.panoramas.camera_of(body.panorama))
         service.check_camera(camera)
         cancelled = threading.Event()
         try:

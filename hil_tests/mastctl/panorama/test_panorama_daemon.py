@@ -21,6 +21,7 @@ from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
+from mastctl.panorama.compose import picture_at
 from mastctl.panorama.folder import Folder
 
 ROVER = """
@@ -44,7 +45,8 @@ def rover(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     cameras = {name: cropped(rig.cameras[name]) for name in rig.stereo["navcam"]}
     small = Rig("small", rig.mast, cameras, {"navcam": rig.stereo["navcam"]})
     save_rig(small, folder / "rig.yaml")
-    save_rig(replace(small, name="other"), folder / "other.yaml")
+    turned = replace(small.mast, rotation_rad=np.add(small.mast.rotation_rad, [0.0, 0.0, 5e-3]))
+    save_rig(replace(small, name="other", mast=turned), folder / "other.yaml")
     (folder / "rover.yaml").write_text(ROVER)
     return folder / "rover.yaml"
 
@@ -82,6 +84,15 @@ def pixel_of(index: dict[str, Any], x: float = 0.5, y: float = 0.5) -> dict[str,
     return {"id": index["id"], "x_px": x * (width - 1), "y_px": y * (height - 1)}
 
 
+def folder_of(rover: Path, index: dict[str, Any]) -> Folder:
+    return Folder(rover.parent / "state" / "panoramas" / index["id"])
+
+
+def preview(client: Client, index: dict[str, Any], **more: Any) -> Any:
+    body = {"panorama": pixel_of(index, 0.35, 0.4) | more}
+    return client.daemon.json(dict, "POST", "/point/preview", json=body)
+
+
 def refused(code: str, act: Any) -> str:
     with pytest.raises(ClientError) as refusal:
         act()
@@ -97,7 +108,7 @@ def test_views_cover_the_field_at_rest_with_evidence(panorama: dict[str, Any], r
     whole = panorama["whole"]
     assert whole["count"] >= 10 and max(whole["rms_px"]) < 0.5
     assert "slip" not in panorama
-    folder = Folder(rover.parent / "state" / "panoramas" / panorama["id"])
+    folder = folder_of(rover, panorama)
     mosaic = folder.path / "mosaic.png"
     assert mosaic.stat().st_size > 10_000 and (folder.path / "preview.jpg").is_file()
     assert folder.mast.digest == panorama["mast_digest"]
@@ -142,6 +153,12 @@ def test_head_and_targets_are_drawn_where_they_are_seen(client: Client, panorama
     assert middle[0] == pytest.approx(away_px, abs=0.05 * mosaic["px_per_rad"])
 
 
+def test_a_preview_by_direction_is_where_the_surface_is(client: Client, panorama: dict[str, Any]) -> None:
+    seen = preview(client, panorama, by_direction=True)
+    assert seen["range_from"] == "surface"
+    assert seen["position_m"][2] == pytest.approx(0.0, abs=1e-6), "the ground"
+
+
 def test_a_pixel_beside_the_views_is_refused(client: Client, panorama: dict[str, Any]) -> None:
     beside = {"id": panorama["id"], "x_px": -50.0, "y_px": 3.0}
     assert "shows no view" in refused("outside_panorama", lambda: client.point(panorama=beside))
@@ -151,7 +168,10 @@ def test_a_pixel_beside_the_views_is_refused(client: Client, panorama: dict[str,
             client.panorama_file(panorama["id"], file)
 
 
-def test_another_mast_file_is_refused_by_name_or_recomputed(client: Client, panorama: dict[str, Any]) -> None:
+def test_another_mast_file_is_refused_by_name_or_recomputed(
+    client: Client, panorama: dict[str, Any], rover: Path
+) -> None:
+    """What is pointed at is what the mosaic shows there, whatever another mast file makes of the angles."""
     client.use_mast("other.yaml")
     try:
         target = pixel_of(panorama, 0.35, 0.4)
@@ -159,6 +179,9 @@ def test_another_mast_file_is_refused_by_name_or_recomputed(client: Client, pano
         record: Any = client.wait(client.point(panorama=target | {"recompute": True}), 300.0)
         assert record["state"] == "done", record["error"]
         assert np.abs(record["residual_px"]).max() < 0.3
+        clicked = picture_at(folder_of(rover, panorama), (target["x_px"], target["y_px"])).pixel_px
+        pixel = record["request"]["pixel"]
+        np.testing.assert_allclose([pixel["x_px"], pixel["y_px"]], clicked, atol=1e-6)
     finally:
         client.use_former_mast()
 
@@ -176,6 +199,12 @@ def test_a_stop_keeps_what_was_taken_and_resume_goes_on(client: Client) -> None:
     operation = client.take_panorama(**FIELD)
     name = str(client.operation(operation)["request"]["panorama"])
     until(lambda: any(one["state"] == "taken" for one in client.panorama(name)["views"]), "a view")
+    before_ids = [one["id"] for one in client.panoramas()]
+    for other in (FIELD, {"resume": name}):
+        refused("busy", lambda other=other: client.take_panorama(**other))
+    refused("busy", lambda: client.delete_panorama(name))
+    assert [one["id"] for one in client.panoramas()] == before_ids, "nothing is left of what was refused"
+    assert client.panoramas()[0]["state"] == "running"
     client.stop()
     record: Any = client.wait(operation, 60.0)
     index = client.panorama(name)
@@ -200,9 +229,11 @@ def test_a_camera_that_is_gone_ends_it_and_nothing_is_lost(client: Client) -> No
 
 def test_a_full_disk_ends_it_in_a_sentence(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = replace_bytes
+    is_full: list[Path] = []
 
     def full(path: Path, data: bytes, mode: int = 0o600) -> None:
-        if path.name.startswith("002-"):
+        if path.name.startswith("002-") or is_full:
+            is_full.append(path)
             raise OSError(28, "No space left on device")
         whole(path, data, mode)
 
@@ -210,14 +241,16 @@ def test_a_full_disk_ends_it_in_a_sentence(client: Client, monkeypatch: pytest.M
     record, index = taken(client)
     assert record["state"] == "failed" and "No space left on device" in record["error"]["message"]
     assert [view["state"] for view in index["views"][:3]] == ["taken", "taken", "wanted"]
-    assert index["state"] == "ended" and "No space left on device" in index["reason"]
+    assert index["state"] == "ended" and "disk was full" in index["reason"]
 
 
 def test_a_killed_daemons_panorama_goes_on_in_the_next(rover: Path, tmp_path: Path) -> None:
-    """A kill leaves the index of the last view, whose state is still running."""
+    """A kill leaves the index of the last view, whose state is still running; a picture may be damaged."""
     config = replace(load_config(rover), state_folder=tmp_path / "state")
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
         _, index = taken(client)
+        client.pose((1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+        refused("rover_moved", lambda: preview(client, index))
     path = tmp_path / "state" / "panoramas" / index["id"]
     folder = Folder(path)
     views = [
@@ -225,9 +258,21 @@ def test_a_killed_daemons_panorama_goes_on_in_the_next(rover: Path, tmp_path: Pa
         for at, view in enumerate(folder.index.views)
     ]
     folder.save(folder.index.model_copy(update={"state": "running", "views": views, "mosaic": None}))
+    (path / folder.index.views[1].frames["navcam_left"].file).write_bytes(b"no picture")
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
+        assert client.panoramas()[0]["state"] == "ended"
+        assert "not the picture" in refused(
+            "unreadable", lambda: client.daemon.request("GET", f"/panoramas/{index['id']}/picture")
+        )
         record, index = taken(client, resume=index["id"])
     assert record["state"] == "done" and all(view["state"] == "taken" for view in index["views"])
+    left = {name: one for name, one in config.hardware.cameras.items() if name == "navcam_left"}
+    config = replace(config, hardware=replace(config.hardware, cameras=left))
+    with RunningDaemon(config) as daemon, Client(daemon.url) as client:
+        refused("unknown_camera", lambda: client.take_panorama(resume=index["id"]))
+        assert preview(client, index)["range_from"] == "surface"
+        assert client.delete_panorama(index["id"]) == [] and not path.exists()
+        refused("panorama_unknown", lambda: client.delete_panorama(index["id"]))
 
 
 def test_another_client_takes_the_lease_and_it_ends(client: Client, daemon: RunningDaemon) -> None:
@@ -280,7 +325,11 @@ def test_the_command_brings_the_folder_shows_composes_exports_and_points(
     assert project.read_text().count("\ni w400 h300") == len(index["views"])
     capsys.readouterr()
     assert main(["point", "--panorama", str(out), "--pixel", "200", "100", *url, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["state"] == "done"
+    record = json.loads(capsys.readouterr().out)
+    assert record["state"] == "done"
+    clicked = picture_at(Folder(out), (200.0, 100.0)).pixel_px  # of this mosaic, not of the daemon's
+    pixel = record["request"]["pixel"]
+    np.testing.assert_allclose([pixel["x_px"], pixel["y_px"]], clicked, atol=1e-6)
     assert main(["point", "--panorama", str(out), "--pixel", "1", "2", "3", *url]) == 2
     assert "--panorama FOLDER --pixel X Y" in capsys.readouterr().err
 
