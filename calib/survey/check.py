@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from calib.files.yaml_text import nearest
+from calib.geometry.rigid import FloatArray
 from calib.survey.diagnoses import (
     joint_mixups,
     mixups,
@@ -20,7 +21,7 @@ from calib.survey.diagnoses import (
     wrong_points,
     wrong_units,
 )
-from calib.survey.records import Survey, SurveyFinding, SurveyImage
+from calib.survey.records import Survey, SurveyCamera, SurveyFinding, SurveyImage
 
 FEWEST_BOARDS, ENOUGH_BOARDS = 3, 5
 """For a camera, and for the mast; the paper finds 5 to 8 positions adequate."""
@@ -64,8 +65,9 @@ def check_survey(survey: Survey, *, only_camera_images: bool = False) -> tuple[S
 
 
 def _of_cameras(survey: Survey) -> Iterator[SurveyFinding]:
-    """Yield cameras without images, and images without dots or corners and picture."""
-    what = "corners" if survey.boards else "dots"
+    """Yield cameras without images, and images without dots or corners and picture, or with few of them."""
+    # With fewer an image's pose says little about the lens.
+    what, fewest = ("corners", 8) if survey.boards else ("dots", 20)
     counts = {name: len(found) for name, found in (survey.corners or survey.dots).items()}
     clicked = {click.image for click in survey.clicks}
     for name in survey.cameras:
@@ -100,6 +102,14 @@ def _of_cameras(survey: Survey) -> Iterator[SurveyFinding]:
                 f"camera {name}",
                 f"none of its {len(mine)} images shows corners of a board",
                 "Find the corners of its pictures, or photograph a board with it",
+            )
+        few = [image for image in mine if 0 < counts.get(image.name, 0) < fewest]
+        if few:
+            yield SurveyFinding(
+                "warning",
+                f"camera {name}",
+                f"{len(few)} of {len(mine)} images have fewer than {fewest} {what} ({_some(few)})",
+                "Find more of them, or photograph these placements again with more of the board",
             )
 
 
@@ -191,7 +201,7 @@ def _camera_spread(
     fitted: Sequence[SurveyImage],
     ranges_m: Sequence[float],
 ) -> Iterator[SurveyFinding]:
-    """Yield too few boards, or all at one distance."""
+    """Yield too few boards, at one distance, or in one part of the picture."""
     count = len({(image.setup, image.placement) for image in fitted})
     if count < ENOUGH_BOARDS:
         of_purpose = "" if len(purposes) > 1 else f" of purpose {purposes[0]}"
@@ -210,6 +220,34 @@ def _camera_spread(
             "and place of the camera can trade for each other",
             f"Photograph boards at about {min(ranges_m) / 2:.1f} m or {2 * max(ranges_m):.0f} m as well",
         )
+    pixels = [survey.dots[image.name].pixels_px for image in fitted if image.name in survey.dots]
+    if pixels:
+        yield from _area(survey.cameras[name], np.concatenate(pixels))
+
+
+def _area(camera: SurveyCamera, pixels_px: FloatArray) -> Iterator[SurveyFinding]:
+    """Say where in the picture there are no dots, if that is much of it: a fit's tests see nothing there."""
+    cells = np.clip(((pixels_px + 0.5) / np.array(camera.size_px) * (4, 3)).astype(int), 0, (3, 2))
+    reached = np.zeros((3, 4), dtype=bool)
+    reached[cells[:, 1], cells[:, 0]] = True
+    if reached.mean() >= 0.6:
+        return
+    sides = {
+        "left": reached[:, :2].mean(),
+        "right": reached[:, 2:].mean(),
+        "upper": reached[0].mean(),
+        "lower": reached[2].mean(),
+    }
+    emptiest = min(sides, key=sides.__getitem__)
+    (left, top), (right, bottom) = pixels_px.min(axis=0), pixels_px.max(axis=0)
+    yield SurveyFinding(
+        "warning",
+        f"camera {camera.name}",
+        f"its dots reach {100 * reached.mean():.0f} % of the picture (x {left:.0f} to {right:.0f}, "
+        f"y {top:.0f} to {bottom:.0f} of {camera.size_px[0]}x{camera.size_px[1]} px); "
+        "the lens is not measured elsewhere",
+        f"Photograph boards in the {emptiest} part of the picture",
+    )
 
 
 def _mast_spread(survey: Survey) -> Iterator[SurveyFinding]:
@@ -236,6 +274,14 @@ def _mast_spread(survey: Survey) -> Iterator[SurveyFinding]:
                 f"{wanted:g} are wanted, which leaves parts of the mast unknown",
                 f"Photograph boards at other angles of {joint}, best over the whole range of use",
             )
+    boards = {(image.setup, image.placement) for image in head if image.purpose == "mast"}
+    if len(boards) < ENOUGH_BOARDS:
+        yield SurveyFinding(
+            "warning",
+            "the mast",
+            f"{len(boards)} placements of purpose mast; {ENOUGH_BOARDS} to 8 are adequate",
+            "Photograph more placements over the range of pan and tilt",
+        )
 
 
 def _some(images: Sequence[SurveyImage]) -> str:

@@ -126,6 +126,40 @@ def test_boards_at_one_distance(good: Survey) -> None:
     assert "m as well" in findings[0].advice
 
 
+@pytest.mark.parametrize(
+    ("share", "place", "emptiest"), [(0.3, 0.0, "right"), (0.2, 0.52, "left")], ids=["left", "middle"]
+)
+def test_dots_in_one_part_of_the_picture(good: Survey, share: float, place: float, emptiest: str) -> None:
+    width = good.cameras["navcam_left"].size_px[0]
+    dots = {
+        n: replace(d, pixels_px=d.pixels_px * (share, 1) + (place * width, 0)) if "navcam_left" in n else d
+        for n, d in good.dots.items()
+    }
+    findings = check_survey(replace(good, dots=dots))
+    finding = only(tuple(f for f in findings if "of the picture" in f.message))
+    assert (finding.severity, finding.place) == ("warning", "camera navcam_left")
+    assert finding.advice == f"Photograph boards in the {emptiest} part of the picture"
+
+
+def test_images_with_few_dots(good: Survey) -> None:
+    names = [i.name for i in good.images if i.camera == "navcam_left"][:5]
+    seen = {name: good.dots[name] for name in names}
+    few = {
+        n: replace(d, rows=d.rows[:4], columns=d.columns[:4], pixels_px=d.pixels_px[:4])
+        for n, d in seen.items()
+    }
+    finding = only(check_survey(replace(good, dots={**good.dots, **few})))
+    assert (finding.severity, finding.place) == ("warning", "camera navcam_left")
+    assert f"5 of 20 images have fewer than 20 dots ({names[0]}, " in finding.message
+
+
+def test_few_boards_for_the_mast(good: Survey) -> None:
+    kept = sorted({i.placement for i in good.images if i.purpose == "mast"})[:4]
+    changed = with_images(good, lambda i: i if i.purpose != "mast" or i.placement in kept else None)
+    findings = [f.message for f in check_survey(changed) if f.place == "the mast"]
+    assert "4 placements of purpose mast; 5 to 8 are adequate" in findings
+
+
 def test_few_boards(good: Survey) -> None:
     kept = {i.placement for i in good.images if i.camera == "hazcam_left" and i.purpose == "camera"}
     for count, severity in ((2, "error"), (3, "warning"), (4, "warning")):
