@@ -76,7 +76,9 @@ _STORAGE = re.compile(
     rb"\A(?:\s|\xef\xbb\xbf|#[^\n]*\n)*(?:%YAML:|<opencv_storage|<\?xml)|!!opencv-|\"opencv-"
 )
 _XML = re.compile(rb"\A(?:\s|\xef\xbb\xbf)*<")
-_TAG = re.compile(rb"!!opencv-[a-z-]+|^%YAML.*$", re.MULTILINE)
+_TAG = re.compile(rb"!!opencv-[a-z-]+|^(?:\xef\xbb\xbf)?%YAML.*$", re.MULTILINE)
+_ESCAPE = re.compile(rb"(\\\\)|\\(?=')")
+"""OpenCV writes an apostrophe as no other YAML or JSON does, after a backslash."""
 _BETWEEN = re.compile(rb"^---[ \t]*\r?$", re.MULTILINE)
 _CONTENT = re.compile(rb"^[ \t]*[^\s#]", re.MULTILINE)
 
@@ -93,7 +95,8 @@ def read_document(data: bytes, path: str | Path) -> dict[str, Any]:
     """
     if _XML.match(data):
         return _xml(data, path)
-    data = _TAG.sub(b"", data)  # the rest of OpenCV's YAML and JSON is plain
+    if looks_like_storage(data):  # the rest of OpenCV's YAML and JSON is plain
+        data = _ESCAPE.sub(rb"\1", _TAG.sub(b"", data))
     lines = b""
     for part in _BETWEEN.split(data):
         if _CONTENT.search(part):

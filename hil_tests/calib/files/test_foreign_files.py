@@ -171,7 +171,7 @@ def test_each_form_of_opencvs_storage_is_read(suffix: str, tmp_path: Path) -> No
     path = storage(
         suffix,
         tmp_path,
-        calibration_time="today",
+        calibration_time="Bob's \\ today",
         image_width=640,
         image_height=480,
         camera_matrix=MATRIX,
@@ -186,7 +186,15 @@ def test_each_form_of_opencvs_storage_is_read(suffix: str, tmp_path: Path) -> No
 
 @pytest.mark.parametrize(
     "head",
-    ["%YAML:1.0\n", "%YAML:1.0 # by me\n---\n", "# mine\n\n%YAML:1.0\n# more\n---\n", "%YAML 1.0\n---\n"],
+    [
+        *(
+            "%YAML:1.0\n",
+            "%YAML:1.0 # by me\n---\n",
+            "# mine\n\n%YAML:1.0\n# more\n---\n",
+            "%YAML 1.0\n---\n",
+        ),
+        "\ufeff%YAML:1.0\n---\n",
+    ],
 )
 def test_a_head_with_comments_is_read(head: str, tmp_path: Path) -> None:
     text = (
