@@ -12,7 +12,7 @@ LATER = [pytest.param(name, marks=OTHER) for name in ("feetech", "feetech_echo")
 
 
 @pytest.mark.parametrize("driver", ["dynamixel", "ptu", *LATER])
-@pytest.mark.parametrize("word", ["corrupt", "swapped", "hang_up", "mixture"])
+@pytest.mark.parametrize("word", ["corrupt", "swapped", "hang_up", "voltage_dip", "mixture"])
 def test_no_fault_makes_a_driver_report_a_wrong_angle(driver: str, word: str) -> None:
     assert word in WORDS
     row = run_word(driver, word, transactions=60, seed=7)

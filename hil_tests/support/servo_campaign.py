@@ -179,7 +179,7 @@ class ServoRun:
 
     def _recover(self) -> bool:
         """Wait for a healthy reading and a move that is taken; False if it has to be switched off and on."""
-        began_s, read, hardware, last = self._rig.clock.now_s(), False, False, ""
+        began_s, read, faulty, moved, last = self._rig.clock.now_s(), False, False, False, ""
         while self._rig.clock.now_s() - began_s < RECOVERY_S:
             self._row.calls += 1
             started_s = self._rig.clock.now_s()
@@ -188,10 +188,11 @@ class ServoRun:
                     reading = self._rig.head.read()
                     self._judge.reading(reading, started_s, self._rig.clock.now_s())
                     read = not reading.faults
-                    hardware = hardware or bool(reading.faults)
-                if read or hardware:
+                    faulty = bool(reading.faults)
+                if read or (faulty and not moved):  # a supply is judged where a way ends
                     self._rig.head.stop()
                     self._rig.head.move(0.0, 0.0)
+                    moved = True
                     if read:
                         return True
             except HardwareFault:
