@@ -28,6 +28,9 @@ STEEPEST_RAD = math.radians(80.0)
 BORDER_STEPS = 24
 MOST_PX = 30000
 """Longest side of a mosaic: cv2.remap takes up to 32767."""
+MOST_AREA_PX = 60_000_000
+"""Composing takes some 12 bytes a pixel."""
+LEAST_PX_PER_RAD = 60.0
 
 
 @dataclass(frozen=True)
@@ -183,14 +186,18 @@ def canvas_of(
 ) -> Canvas:
     """Return the canvas that holds all that some cameras (in the rover frame) see, at the lens' resolution.
 
-    Raises CalibError if it would have more than 30,000 pixels along a side.
+    That is less where the canvas would have more than 30,000 pixels along a side, or 60 million in all.
+    Raises CalibError if ``px_per_rad`` is less than 60, or makes it larger than that.
     """
-    scale = px_per_rad or max(camera.focal_px[0] for camera in cameras)
-    middle = sum(_middle(camera) for camera in cameras) / len(cameras)
-    local = rover_from_mosaic.inverse.vectors(np.asarray(middle))
-    about_rad = math.atan2(local[1], local[0])
+    scale = max(camera.focal_px[0] for camera in cameras) if px_per_rad is None else px_per_rad
+    if not scale >= LEAST_PX_PER_RAD:
+        raise CalibError(
+            f"{scale:g} px per radian where {LEAST_PX_PER_RAD:g} (about 1 px per degree) or more are expected"
+        )
+    about_rad = _middle_rad(rover_from_mosaic.inverse.vectors([_middle(camera) for camera in cameras]))
     probe = Canvas(projection, scale, about_rad, 0.0, (1, 1), rover_from_mosaic, surface)
     borders = np.concatenate([probe.of_camera(camera, border(camera)) for camera in cameras])
+    borders = np.concatenate([borders, _poles(cameras, probe)])
     borders = borders[np.isfinite(borders).all(axis=1)]
     if projection == "cylindrical":
         borders = borders[np.abs(borders[:, 1]) < math.tan(STEEPEST_RAD) * scale]
@@ -199,13 +206,30 @@ def canvas_of(
     low = np.floor(borders.min(axis=0) - ahead - 0.5) + 0.5
     size = np.ceil(borders.max(axis=0) - ahead - low).astype(int) + 1
     width, height = min(int(size[0]), int(2.0 * math.pi * scale)), int(size[1])
-    if max(width, height) > MOST_PX:
+    most = min(MOST_PX / max(width, height), math.sqrt(MOST_AREA_PX / (width * height)))
+    if most < 1.0:
+        if px_per_rad is None:
+            return canvas_of(cameras, rover_from_mosaic, surface, projection, 0.99 * most * scale)
         raise CalibError(
-            f"the mosaic would have {width}x{height} px; fewer than {scale:.0f} px per radian are expected"
+            f"the mosaic would have {width}x{height} px; at most {most * scale:.0f} px per radian "
+            f"({math.radians(most * scale):.1f} px per degree) are expected"
         )
     top = -low[1] / scale
     top = math.atan(top) if projection == "cylindrical" else top
     return replace(probe, azimuth_rad=low[0] / scale, elevation_rad=top, size_px=(width, height))
+
+
+def _poles(cameras: Sequence[CameraModel], probe: Canvas) -> FloatArray:
+    """Pixels (n, 2) of straight up and down where a camera sees it: its border goes all round them."""
+    found: list[tuple[float, float]] = []
+    for up in (1.0, -1.0):
+        direction = probe.rover_from_mosaic.vectors(np.array([0.0, 0.0, -up]))
+        for camera in cameras:
+            place, seen = probe.direction_in_camera(camera, direction)
+            if bool(seen) and camera.holds(place):
+                y = -up * probe.px_per_rad * (math.pi / 2.0 if probe.projection == "equirectangular" else 1e9)
+                found += [(part * math.pi * probe.px_per_rad, y) for part in (-1.0, 1.0)]
+    return np.array(found).reshape(-1, 2)
 
 
 def border(camera: CameraModel) -> FloatArray:
@@ -220,6 +244,14 @@ def border(camera: CameraModel) -> FloatArray:
         np.column_stack([np.zeros_like(y), height - 1.0 - y]),
     ]
     return np.concatenate(sides)
+
+
+def _middle_rad(directions: FloatArray) -> float:
+    """Azimuth opposite the widest gap between directions (n, 3), of equal ones the one behind the most."""
+    azimuth = np.sort(np.arctan2(directions[:, 1], directions[:, 0]))
+    gaps = np.diff(azimuth, append=azimuth[0] + 2.0 * math.pi)
+    cut = azimuth + gaps / 2.0
+    return math.remainder(float(cut[np.argmax(gaps - 0.05 * np.cos(cut))]) + math.pi, 2.0 * math.pi)
 
 
 def _middle(camera: CameraModel) -> FloatArray:

@@ -9,9 +9,10 @@ between them alike, and is found by its size and axis.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Literal
 
 import cv2
@@ -36,6 +37,7 @@ REDUCED = 8
 GREYS = (8.0, 247.0)
 """What is darker or brighter says nothing about a gain."""
 PATCHES_A_SEAM = 6
+GREYS_KEPT = 32
 SEARCH_PX = 16.0
 MATCH = MatchSettings(roughness=0.0)
 RELIEF_PER_M = 0.5
@@ -194,7 +196,7 @@ class Seams:
 
 def seams_of(canvas: Canvas, cameras: Sequence[CameraModel], pictures: Sequence[Picture]) -> Seams:
     """Measure how well pictures agree where they meet, by their cameras (in the rover frame)."""
-    greys = [grey(picture) for picture in pictures]
+    greys = lru_cache(GREYS_KEPT)(lambda number: grey(pictures[number]))
     small = canvas.at(canvas.px_per_rad / REDUCED)
     owners, _ = frames_of(small, cameras)
     patches = []
@@ -302,7 +304,7 @@ def _rate(
 
 
 def _measured(
-    canvas: Canvas, cameras: Sequence[CameraModel], greys: Sequence[Grey], views: tuple[int, int],
+    canvas: Canvas, cameras: Sequence[CameraModel], greys: Callable[[int], Grey], views: tuple[int, int],
     place: FloatArray,
 ) -> SeamPatch | None:  # fmt: skip
     """Match the patch at a mosaic's pixel between two views; None where nothing good is found."""
@@ -314,7 +316,7 @@ def _measured(
     try:
         plane = _plane(canvas, cameras[i], first, point)
         found = match_patch(
-            PosedImage(greys[i], cameras[i]), first, plane, PosedImage(greys[j], cameras[j]), SEARCH_PX, MATCH
+            PosedImage(greys(i), cameras[i]), first, plane, PosedImage(greys(j), cameras[j]), SEARCH_PX, MATCH
         )
         if found.verdict != "good":
             return None

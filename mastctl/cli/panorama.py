@@ -70,14 +70,15 @@ def _take(args: argparse.Namespace) -> Answer:
 
 def _bring(client: Client, name: str, out: Path) -> None:
     """Copy a panorama from the daemon: what is not there yet, the index last."""
-    from mastctl.panorama.folder import INDEX, MAST, MOSAIC, PREVIEW
+    from calib.files import digest_of, is_plain_file
+    from mastctl.panorama.folder import INDEX, MAST, MOSAIC, PREVIEW, Index
 
-    index = client.panorama(name)
-    frames = [one["file"] for view in index["views"] for one in view["frames"].values()]
-    composed = [MOSAIC, PREVIEW] if index.get("mosaic") else []
+    index = Index.model_validate(client.panorama(name))
+    frames = {one.file: one.sha256 for view in index.views for one in view.frames.values()}
+    composed = [MOSAIC, PREVIEW] if index.mosaic is not None else []
     for file in (MAST, *frames, *composed, INDEX):
         path = out / file
-        if file in frames and path.is_file():
+        if file in frames and is_plain_file(path) and digest_of(path.read_bytes()) == frames[file]:
             continue
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -127,11 +128,8 @@ def _compose(args: argparse.Namespace) -> Answer:
     example="panorama --gpano sphere.jpg",
 )
 def _export(args: argparse.Namespace) -> Answer:
-    import cv2
-    import numpy as np
-
     from mastctl.panorama.exports import gpano, hugin
-    from mastctl.panorama.folder import MOSAIC, Folder
+    from mastctl.panorama.folder import Folder
 
     folder = Folder(args.folder)
     if folder.index.mosaic is None:
@@ -142,8 +140,7 @@ def _export(args: argparse.Namespace) -> Answer:
     check_file(out, "--gpano" if args.gpano else "--hugin")
     document: dict[str, Any] = {"file": str(out)}
     if args.gpano is not None:
-        mosaic = cv2.imread(str(args.folder / MOSAIC), cv2.IMREAD_UNCHANGED)
-        gpano(np.asarray(mosaic, np.uint8), canvas, out)
+        gpano(folder.mosaic(), canvas, out)
         return Answer(document, f"{out}: a sphere's part of {canvas.size_px[0]}x{canvas.size_px[1]} px")
     camera = folder.index.cameras[0]
     files = [str((args.folder / view.frames[camera].file).resolve()) for _, view in folder.index.taken()]

@@ -36,10 +36,11 @@ def gpano(mosaic: Picture, canvas: Canvas, path: Path) -> None:
     """
     height, width = mosaic.shape[:2]
     full = 2 * round(math.pi * canvas.px_per_rad)
-    left, top = _corner(canvas, full, full // 2)
+    full_height = _full_height(canvas, full // 2)
+    left, top = _corner(canvas, full, full_height)
     facts = {
         "FullPanoWidthPixels": full,
-        "FullPanoHeightPixels": full // 2,
+        "FullPanoHeightPixels": full_height,
         "CroppedAreaImageWidthPixels": width,
         "CroppedAreaImageHeightPixels": height,
         "CroppedAreaLeftPixels": left,
@@ -76,10 +77,14 @@ def hugin(cameras: Sequence[CameraModel], files: Sequence[str], canvas: Canvas, 
     fov = " ".join(f"{name}{value!r}" for name, value in zip(names, lens.tolist(), strict=True))
     w, h = canvas.size_px
     whole = 4 * math.floor(math.pi / 2.0 * canvas.px_per_rad)  # nearly a whole sphere, cropped to the mosaic
-    left, top = _corner(canvas, whole, whole // 2)
-    field = f"w{whole} h{whole // 2} v{math.degrees(whole / canvas.px_per_rad)!r}"
+    tall = _full_height(canvas, whole // 2)
+    left, top = _corner(canvas, whole, tall)
+    field = f"w{whole} h{tall} v{math.degrees(whole / canvas.px_per_rad)!r}"
     crop = f"S{left},{left + w},{top},{top + h}"
-    lines = [f'p f2 {field} E0 R0 {crop} n"TIFF_m c:LZW"', "m g1 i0 m2 p0.00784314"]
+    lines = [
+        f'p f{1 if canvas.projection == "cylindrical" else 2} {field} E0 R0 {crop} n"TIFF_m c:LZW"',
+        "m g1 i0 m2 p0.00784314",
+    ]
     mosaic_from_rover = canvas.rover_from_mosaic.inverse
     for number, (camera, file) in enumerate(zip(cameras, files, strict=True)):
         yaw, pitch, roll = _angles_deg(mosaic_from_rover.rotation @ _axes(camera) @ turn)
@@ -95,7 +100,21 @@ def hugin(cameras: Sequence[CameraModel], files: Sequence[str], canvas: Canvas, 
 def _corner(canvas: Canvas, width: int, height: int) -> tuple[int, int]:
     """Column and row of a mosaic's top-left pixel in a picture of the sphere, 0, 0 in its middle."""
     left = canvas.azimuth_rad * canvas.px_per_rad + (width - 1) / 2.0
-    return round(left), round((height - 1) / 2.0 - canvas.elevation_rad * canvas.px_per_rad)
+    return round(left), round((height - 1) / 2.0 - _rise_px(canvas))
+
+
+def _rise_px(canvas: Canvas) -> float:
+    """How far a mosaic's first row lies above the horizon."""
+    rise = canvas.elevation_rad
+    return (math.tan(rise) if canvas.projection == "cylindrical" else rise) * canvas.px_per_rad
+
+
+def _full_height(canvas: Canvas, sphere: int) -> int:
+    """Rows of the whole picture about the horizon: of a sphere, or what a cylinder's mosaic needs."""
+    if canvas.projection == "equirectangular":
+        return sphere
+    above = _rise_px(canvas)
+    return 2 * math.ceil(max(above, canvas.size_px[1] - 1 - above) + 1.0)
 
 
 def _hugin_lens(camera: CameraModel) -> tuple[FloatArray, FloatArray, float]:

@@ -11,9 +11,9 @@ a daemon keeps beside it is in the folder, so it opens anywhere.
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import Field
 
 from calib.errors import BadFile
-from calib.files import read_bytes, replace_bytes, write_new
+from calib.files import digest_of, read_bytes, replace_bytes, write_new
 from calib.files.mast_file import CameraName, StoredRig, load_rig
 from calib.files.records import ABSENT, Moment, Number, Pair, Record, Text, Vector, parse_record
 from calib.files.yaml_text import dump_mapping
@@ -38,6 +38,7 @@ SCHEMA: Literal["mastctl/panorama/1"] = "mastctl/panorama/1"
 INDEX, MAST, MOSAIC, PREVIEW = "index.yaml", "mast.yaml", "mosaic.png", "preview.jpg"
 PREVIEW_PX = 2048
 MOST_BYTES = 1 << 28
+PICTURES_KEPT = 32
 Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
@@ -203,18 +204,26 @@ class Folder:
             raise BadFile(self.path / file, "", f"cannot be written: {error.strerror or error}") from None
         facts = as_json(frame.facts)
         wanted = {name: facts[name] for name in FrameRecord.model_fields if name in facts}
-        return FrameRecord(file=file, sha256=hashlib.sha256(data).hexdigest(), **wanted)
+        return FrameRecord(file=file, sha256=digest_of(data), **wanted)
 
     def picture(self, frame: FrameRecord) -> Picture:
         """Return a view's picture. Raises BadFile if it is not the one that was taken."""
         path = self.path / frame.file
         data = read_bytes(path, MOST_BYTES)
-        image = None
-        if hashlib.sha256(data).hexdigest() == frame.sha256:
-            image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        if image is None:
+        if digest_of(data) != frame.sha256:
             raise BadFile(path, "", "is not the picture that was taken; the index has another digest")
-        return np.asarray(image, dtype=np.uint8)
+        return _decoded(path, data)
+
+    def mosaic(self) -> Picture:
+        """Return the mosaic that the index describes. Raises BadFile."""
+        path, record = self.path / MOSAIC, self.index.mosaic
+        assert record is not None
+        image = _decoded(path, read_bytes(path, MOST_BYTES))
+        if [image.shape[1], image.shape[0]] != record.size_px:
+            raise BadFile(
+                path, "", "has another size than the index says; 'mastctl panorama compose' mends it"
+            )
+        return image
 
     def frame(self, number: int, camera: str) -> StampedFrame:
         """Return a picture of a view with its facts, as a camera gave it. Raises BadFile."""
@@ -235,10 +244,24 @@ class Folder:
         name = self.index.cameras[0]
         return [self.mast.rig.camera_in_rover(name, *angles) for angles in self.angles_rad()]
 
-    def pictures(self) -> list[Picture]:
-        """Return the pictures of the mosaic's camera. Raises BadFile."""
-        name = self.index.cameras[0]
-        return [self.picture(view.frames[name]) for _, view in self.index.taken()]
+    def pictures(self) -> Pictures:
+        """Return the pictures of the mosaic's camera."""
+        return Pictures(self)
+
+
+class Pictures(Sequence[Picture]):
+    """The pictures of a mosaic's camera, read when they are needed; a few are kept. Raises BadFile."""
+
+    def __init__(self, folder: Folder) -> None:
+        name = folder.index.cameras[0]
+        self._frames = [view.frames[name] for _, view in folder.index.taken()]
+        self._read = lru_cache(PICTURES_KEPT)(lambda at: folder.picture(self._frames[at]))
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, at: Any) -> Any:
+        return self._read(range(len(self))[at])
 
 
 def write_picture(path: Path, picture: Picture, options: Mapping[int, int] | None = None) -> None:
@@ -249,6 +272,13 @@ def write_picture(path: Path, picture: Picture, options: Mapping[int, int] | Non
         replace_bytes(path, data, 0o644)
     except OSError as error:
         raise BadFile(path, "", f"cannot be written: {error.strerror or error}") from None
+
+
+def _decoded(path: Path, data: bytes) -> Picture:
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise BadFile(path, "", "is no picture")
+    return np.asarray(image, dtype=np.uint8)
 
 
 def _save(path: Path, index: Index) -> None:

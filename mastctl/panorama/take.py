@@ -23,6 +23,9 @@ from mastctl.panorama.compose import Composition, compose
 from mastctl.panorama.folder import Folder, ViewRecord
 
 MOST_VIEWS = 400
+STEEP_RAD = 0.8
+"""A view that is steeper may hold the pole; how much of the elevations it covers is measured less steeply."""
+LEAST_WIDTH_RAD = 0.01
 TRIES = 2
 IN_A_ROW = 3
 """So many views in a row that fail are no longer the views' fault."""
@@ -44,11 +47,11 @@ def grid_of(rig: Rig, camera: str, pan_rad: Pair, tilt_rad: Pair, overlap: float
     it. Raises BadRequest ``too_many_views``.
     """
     low, high = sorted(tilt_rad)
-    _, _, bottom, top = _covered(rig, camera, (low + high) / 2.0)
-    middle = (low + high) / 2.0
+    middle = max(-STEEP_RAD, min(STEEP_RAD, (low + high) / 2.0))
+    _, _, bottom, top = _covered(rig, camera, middle)
     tilts = _spread(low - (bottom - middle), high - (top - middle), top - bottom, overlap)
     views: list[Pair] = []
-    for row, tilt in enumerate(reversed(tilts)):
+    for row, tilt in enumerate(max(low, min(high, one)) for one in reversed(tilts)):
         left, right, _, _ = _covered(rig, camera, tilt)
         pans = _spread(min(pan_rad) - left, max(pan_rad) - right, right - left, overlap)
         views += [(pan, tilt) for pan in (reversed(pans) if row % 2 else pans)]
@@ -61,7 +64,7 @@ def _spread(first: float, last: float, width: float, overlap: float) -> list[flo
     """Even steps from the first to the last centre of fields of a width; one in the middle if that does."""
     if last <= first:
         return [(first + last) / 2.0]
-    count = math.ceil((last - first) / (width * (1.0 - overlap)) - 1e-9) + 1
+    count = math.ceil((last - first) / (max(width, LEAST_WIDTH_RAD) * (1.0 - overlap)) - 1e-9) + 1
     return [float(one) for one in np.linspace(first, last, count)]
 
 

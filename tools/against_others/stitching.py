@@ -115,7 +115,7 @@ def main() -> int:
         cameras, pictures = flight_pictures()
     else:
         folder = Folder(args.panorama)
-        cameras, pictures = folder.cameras(), folder.pictures()
+        cameras, pictures = folder.cameras(), list(folder.pictures())
     origin = Rigid(np.eye(3), np.mean([camera.C for camera in cameras], axis=0))
     canvas = canvas_of(cameras, origin, MosaicSurface.of(args.surface))
     known, seams = ours(canvas, cameras, pictures)

@@ -204,6 +204,29 @@ def test_a_surface_that_is_none_is_refused(text: str) -> None:
         MosaicSurface.of(text)
 
 
-def test_a_mosaic_too_large_is_refused(whole_rig: Rig) -> None:
-    with pytest.raises(CalibError, match="px per radian are expected"):
+def test_a_mosaic_too_large_is_refused_and_a_long_lens_gets_what_fits(whole_rig: Rig) -> None:
+    with pytest.raises(CalibError, match="px per degree"):
         canvas_of(views(whole_rig), Rigid.identity(), MosaicSurface.of("infinity"), px_per_rad=1e5)
+    model = whole_rig.cameras["navcam_left"].model
+    long = replace(model, H=model.H + 19.0 * (model.H - model.A * (model.H @ model.A)))
+    turned = [long.moved(whole_rig.mast.rover_from_head(float(pan), 0.0)) for pan in np.linspace(-3, 3, 31)]
+    canvas = canvas_of(turned, Rigid.identity(), MosaicSurface.of("infinity"))
+    width, height = canvas.size_px
+    assert width <= 30_000 and 50_000_000 < width * height <= 60_000_000
+    ahead = canvas.pixels(np.array([1.0, 0.0, 0.0]))
+    assert ahead[0] == pytest.approx(width / 2, rel=0.02), "the cut is behind"
+
+
+@pytest.mark.parametrize("px_per_rad", [0.0, -5.0, math.nan, 1e-3])
+def test_a_resolution_that_is_none_is_refused(whole_rig: Rig, px_per_rad: float) -> None:
+    with pytest.raises(CalibError, match="or more are expected"):
+        canvas_of(views(whole_rig), Rigid.identity(), MosaicSurface.of("infinity"), px_per_rad=px_per_rad)
+
+
+@pytest.mark.parametrize("tilt_rad", [1.4, -1.4])
+def test_a_view_of_straight_up_or_down_is_whole_on_the_canvas(whole_rig: Rig, tilt_rad: float) -> None:
+    camera = whole_rig.camera_in_rover("navcam_left", 0.3, tilt_rad)
+    canvas = canvas_of([camera], whole_rig.mast.rover_from_mast, MosaicSurface.of("infinity"))
+    pixels = np.random.default_rng(1).uniform(0.0, 1.0, (5000, 2)) * (np.array(camera.size_px) - 1)
+    found = canvas.of_camera(camera, pixels)
+    assert (found >= -1.0).all() and (found <= np.array(canvas.size_px)).all()

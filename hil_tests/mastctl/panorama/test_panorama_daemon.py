@@ -23,6 +23,7 @@ from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.panorama.compose import picture_at
 from mastctl.panorama.folder import Folder
+from mastctl.panorama.take import grid_of
 
 ROVER = """
 schema: mastctl/config/1
@@ -318,9 +319,19 @@ def test_the_command_brings_the_folder_shows_composes_exports_and_points(
     compose = ["panorama", "compose", str(out), "--surface", "sphere:5", "--px-per-deg", "10"]
     assert main([*compose, "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["mosaic"]["surface"] == "sphere:5"
+    assert main([*compose[:3], "--px-per-deg", "0.001"]) != 0
+    assert "px per radian where 60" in capsys.readouterr().err
     sphere, project = tmp_path / "sphere.jpg", tmp_path / "project.pto"
     assert main(["panorama", "export", str(out), "--gpano", str(sphere)]) == 0
     assert b"GPano:ProjectionType" in sphere.read_bytes()
+    (out / "mosaic.png").write_bytes(b"no picture")
+    assert main(["panorama", "export", str(out), "--gpano", str(sphere)]) == 2
+    assert "mosaic.png: is no picture" in capsys.readouterr().err
+    damaged = out / index["views"][0]["frames"]["navcam_left"]["file"]
+    damaged.write_bytes(b"no picture")
+    assert main(["panorama", "take", "--resume", str(out), *url]) == 0
+    assert len(damaged.read_bytes()) > 1000, "fetched again"
+    assert main([*compose, "--json"]) == 0
     assert main(["panorama", "export", str(out), "--hugin", str(project)]) == 0
     assert project.read_text().count("\ni w400 h300") == len(index["views"])
     capsys.readouterr()
@@ -332,6 +343,13 @@ def test_the_command_brings_the_folder_shows_composes_exports_and_points(
     np.testing.assert_allclose([pixel["x_px"], pixel["y_px"]], clicked, atol=1e-6)
     assert main(["point", "--panorama", str(out), "--pixel", "1", "2", "3", *url]) == 2
     assert "--panorama FOLDER --pixel X Y" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("tilt_rad", [(1.3, 1.4), (-1.5, -1.5), (1.5, 1.5), (-1.5, 1.5)])
+def test_a_steep_field_has_views_inside_it(repository: Path, tilt_rad: tuple[float, float]) -> None:
+    rig = load_rig(repository / "configs/sim/rocky8.yaml").rig
+    views = grid_of(rig, "navcam_left", (-0.5, 0.5), tilt_rad, 0.2)
+    assert all(tilt_rad[0] - 0.05 <= tilt <= tilt_rad[1] + 0.05 for _, tilt in views)
 
 
 def test_a_folder_that_is_none_is_refused_in_a_sentence(tmp_path: Path) -> None:
