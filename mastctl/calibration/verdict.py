@@ -130,7 +130,7 @@ def _of_survey(
 ) -> Iterator[Reason]:
     """The reasons that only a survey has."""
     yield from _wider(fit)
-    yield from _jointly(survey, jointly)
+    yield from _jointly(survey, fit, jointly)
     yield from _turned(fit)
     yield from _at_the_end(fit)
     yield from (Reason("care", sentence) for sentence in _exchanged_boards(survey, fit))
@@ -298,7 +298,7 @@ def _contradictions(fit: FittedRig) -> list[Reason]:
     return [Reason("care", one.sentence) for one in odd]
 
 
-def _jointly(survey: Survey, fit: Calibration | CalibError | None) -> list[Reason]:
+def _jointly(survey: Survey, other: Calibration, fit: Calibration | CalibError | None) -> list[Reason]:
     """What the joint fit's tests say of a survey that another method calibrated."""
     if fit is None:
         return []
@@ -306,6 +306,10 @@ def _jointly(survey: Survey, fit: Calibration | CalibError | None) -> list[Reaso
         untested = "whether sigmas and model are right was not tested"
         return [Reason("care", f"{untested}, since the survey cannot be fitted jointly: {fit}")]
     reasons = [*_sigmas(survey, fit), *_wider(fit), *_contradictions(fit)]
+    left_out = {outlier.name for outlier in other.outliers}
+    if odd := [o.name for o in fit.outliers if o.kind == "image" and o.name not in left_out]:
+        used = f"{_some(odd)} would be left out as too far off, and was used: check tapes, angles and dots"
+        reasons.append(Reason("care", used))
     return [replace(reason, sentence=f"fitted jointly, {reason.sentence}") for reason in reasons]
 
 

@@ -148,5 +148,12 @@ def test_what_the_papers_method_made_is_judged_by_the_joint_fits_tests(
     assert any(
         r.grade == "care" and r.sentence.startswith("fitted jointly, tapes scatter") for r in verdict.reasons
     )
-    lost = judge(survey, fit_paper(survey), jointly=SurveyNotFitted("no start was found"))
+    odd = replace(fitted[1], outliers=(Outlier("image", "image navcam_left-037", 4.7),))
+    by_paper = fit_paper(survey)
+    found = [r for r in judge(survey, by_paper, jointly=odd).reasons if "image navcam_left-037" in r.sentence]
+    assert [r.grade for r in found] == ["care"]
+    assert "check tapes, angles and dots" in found[0].sentence
+    again = judge(survey, replace(by_paper, outliers=odd.outliers), jointly=odd).reasons
+    assert not [r for r in again if "image navcam_left-037" in r.sentence]
+    lost = judge(survey, by_paper, jointly=SurveyNotFitted("no start was found"))
     assert lost.grade == "care" and any("was not tested" in r.sentence for r in lost.reasons)
