@@ -151,9 +151,14 @@ class RigTrial:
 
 @contextmanager
 def rig_under_test(url: str, reach_rad: float) -> Iterator[RigTrial]:
-    """Connect to a daemon that is at rest. Raises NotNow (``busy``) if it is at work, and ClientError."""
+    """Connect to a daemon that is at rest.
+
+    Raises NotNow if it is at work (``busy``) or an emergency stop is latched (``estopped``), and ClientError.
+    """
     with Client(url, TIMEOUT_S, "mastctl conform") as client:
         trial = RigTrial(client, reach_rad)
+        if trial.began["estop"] is not None:  # a person latched it, and a person releases it
+            raise NotNow("estopped", trial.began["reason"])
         at_work = _at_work(trial.began)
         if at_work:
             raise NotNow("busy", f"the daemon at {url} is at work ({at_work}); check it when it rests")

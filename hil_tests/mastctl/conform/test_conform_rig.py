@@ -321,3 +321,27 @@ def test_a_daemon_at_work_is_left_alone(crawling: Proxy, capsys: pytest.CaptureF
         assert main(["conform", crawling.url, "--motion", "--json"]) == 1
         assert refusal(capsys) == "busy"
         assert client.operation(name)["state"] == "running"
+
+
+@pytest.mark.parametrize("when", ["before", "meanwhile"])
+def test_the_emergency_stop_of_a_person_stays_latched(
+    when: str, proxy: Proxy, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Client(proxy.url) as client:
+
+        def stop_too(passing: Passing) -> None:
+            if passing.path == f"{API}/point":
+                with Client(f"http://{proxy.target}") as person:
+                    person.estop(reason="sparks", name="Ana")
+
+        try:
+            if when == "before":
+                client.estop(reason="sparks", name="Ana")
+            else:
+                proxy.after = stop_too
+            assert main(["conform", proxy.url, "--only", "motion.estop", "--motion", "--json"]) == 1
+            assert "sparks" in capsys.readouterr().out
+            assert client.status()["estop"] is not None
+        finally:
+            proxy.honest()
+            client.reset(reason="the test is over", name="test")
