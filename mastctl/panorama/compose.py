@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -55,18 +55,26 @@ def canvas_for(folder: Folder, wanted: Composition) -> Canvas:
     return canvas_of(folder.cameras(), origin, wanted.surface, wanted.projection, wanted.px_per_rad)
 
 
-def compose(folder: Folder, wanted: Composition) -> None:
-    """Write the mosaic, the preview and the seams' errors into a folder. Raises BadFile, CalibError."""
+def compose(folder: Folder, wanted: Composition, between: Callable[[], None] = lambda: None) -> None:
+    """Write the mosaic, the preview and the seams' errors into a folder. Raises BadFile, CalibError.
+
+    ``between`` is called between its parts, and may end it with an error of its own.
+    """
     index = folder.index
     if not index.taken():
         raise BadFile(folder.path, "views", "none was taken, so there is no mosaic")
     cameras, pictures, canvas = folder.cameras(), folder.pictures(), canvas_for(folder, wanted)
     owners, places = frames_of(canvas, cameras)
+    between()
     gains = None if wanted.raw else gains_of(canvas, cameras, pictures)
+    between()
     mosaic = composed(pictures, owners, places, gains)
     del owners, places
+    between()
     seams = seams_of(canvas, cameras, pictures)
+    between()
     slip = slip_of(folder.mast.rig, index.cameras[0], folder.angles_rad(), canvas, seams.patches)
+    between()
     write_picture(folder.path / MOSAIC, mosaic, {cv2.IMWRITE_PNG_COMPRESSION: 1})
     write_picture(folder.path / PREVIEW, reduced(mosaic), JPEG)
     numbers = [number for number, _ in index.taken()]

@@ -26,6 +26,7 @@ MOST_VIEWS = 400
 STEEP_RAD = 0.8
 """A view that is steeper may hold the pole; how much of the elevations it covers is measured less steeply."""
 LEAST_WIDTH_RAD = 0.01
+PAUSE_S = 1e-3
 TRIES = 2
 IN_A_ROW = 3
 """So many views in a row that fail are no longer the views' fault."""
@@ -104,7 +105,7 @@ class PanoramaTaker(Steps):
                     if failed == IN_A_ROW and isinstance(ended, Exception):
                         raise ended
             with self.step("compose") as detail:
-                compose(folder, Composition())
+                compose(folder, Composition(), self._pause)
                 whole, slip = folder.index.whole, folder.index.slip
                 detail.update(seams=None if whole is None else whole.model_dump())
                 detail.update(slip=None if slip is None else slip.sentence)
@@ -162,6 +163,11 @@ class PanoramaTaker(Steps):
         return view.model_copy(
             update={"state": "taken", "reason": "", "frames": frames, "motion_evidence": evidence}
         )
+
+    def _pause(self) -> None:
+        """Let a simulated clock go on, by which a stop is confirmed, and end if there was one."""
+        self._clock.sleep(PAUSE_S)
+        self.check_not_stopped()
 
     @staticmethod
     def _check_pictures(folder: Folder) -> None:

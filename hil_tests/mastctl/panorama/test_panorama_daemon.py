@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from calib.errors import BadFile
 from calib.files import replace_bytes
 from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.rig import Rig
+from calib.matching.mosaic import gains_of
 from hil_tests.mastctl.motion.test_tracking_simulated import cropped
 from hil_tests.waiting import until
 from mastctl.cli.main import main
@@ -216,6 +218,31 @@ def test_a_stop_keeps_what_was_taken_and_resume_goes_on(client: Client) -> None:
     assert record["state"] == "done" and index["state"] == "done"
     assert all(view["state"] == "taken" for view in index["views"])
     assert all(index["views"][at]["frames"] == frames for at, frames in before.items())
+
+
+def test_a_stop_ends_the_composition_and_resume_composes(
+    client: Client, daemon: RunningDaemon, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stopped, stop = threading.Event(), daemon.service.devices.stop
+    stopper = threading.Thread(target=client.stop)
+
+    def stopping() -> None:
+        stopped.set()
+        stop()
+
+    def slow(*given: Any) -> Any:
+        stopper.start()
+        assert stopped.wait(30.0)
+        return gains_of(*given)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(daemon.service.devices, "stop", stopping)
+        patched.setattr("mastctl.panorama.compose.gains_of", slow)
+        record, index = taken(client)
+        stopper.join()
+    assert (record["state"], index["state"]) == ("stopped", "ended") and "mosaic" not in index
+    record, index = taken(client, resume=index["id"])
+    assert record["state"] == "done" and "mosaic" in index
 
 
 def test_a_camera_that_is_gone_ends_it_and_nothing_is_lost(client: Client) -> None:
