@@ -17,6 +17,7 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.mosaic import Canvas
 from calib.geometry.rigid import FloatArray
 from calib.matching.mosaic import Picture
+from mastctl.panorama.folder import write_whole
 
 XMP = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
@@ -62,7 +63,7 @@ def gpano(mosaic: Picture, canvas: Canvas, path: Path) -> None:
         body = b"http://ns.adobe.com/xap/1.0/\x00" + xmp
         packed = b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body
         at = 2  # behind the start of the image
-    _write(path, picture[:at] + packed + picture[at:])
+    write_whole(path, picture[:at] + packed + picture[at:])
 
 
 def hugin(cameras: Sequence[CameraModel], files: Sequence[str], canvas: Canvas, path: Path) -> float:
@@ -93,7 +94,7 @@ def hugin(cameras: Sequence[CameraModel], files: Sequence[str], canvas: Canvas, 
             f"i w{width} h{height} f0 {own} r{roll!r} p{pitch!r} y{yaw!r} "
             f'TrX0 TrY0 TrZ0 j0 g0 t0 Va1 Vb0 Vc0 Vd0 Vx0 Vy0 Vm5 n"{file}"'
         )
-    _write(path, ("# hugin project file\n#hugin_ptoversion 2\n" + "\n".join(lines) + "\n").encode())
+    write_whole(path, ("# hugin project file\n#hugin_ptoversion 2\n" + "\n".join(lines) + "\n").encode())
     return worst_px
 
 
@@ -167,10 +168,3 @@ def _angles_deg(mosaic_from_camera: FloatArray) -> tuple[float, float, float]:
     down = np.cross(ahead, level)
     roll = math.atan2(float(right @ down), float(right @ level))
     return math.degrees(yaw), math.degrees(pitch), math.degrees(roll)
-
-
-def _write(path: Path, data: bytes) -> None:
-    try:
-        path.write_bytes(data)
-    except OSError as error:
-        raise BadFile(path, "", f"cannot be written: {error.strerror or error}") from None

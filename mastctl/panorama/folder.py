@@ -198,10 +198,7 @@ class Folder:
         """Write a picture of a view and return its record. Raises BadFile; nothing is left then."""
         file = f"frames/{number:03d}-{camera}.png"
         data = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
-        try:
-            replace_bytes(self.path / file, data, 0o644)
-        except OSError as error:
-            raise BadFile(self.path / file, "", f"cannot be written: {error.strerror or error}") from None
+        write_whole(self.path / file, data)
         facts = as_json(frame.facts)
         wanted = {name: facts[name] for name in FrameRecord.model_fields if name in facts}
         return FrameRecord(file=file, sha256=digest_of(data), **wanted)
@@ -267,7 +264,11 @@ class Pictures(Sequence[Picture]):
 def write_picture(path: Path, picture: Picture, options: Mapping[int, int] | None = None) -> None:
     """Write a picture by its suffix, whole or not at all. Raises BadFile."""
     flat = [number for pair in (options or {}).items() for number in pair]
-    data = cv2.imencode(path.suffix, picture, flat)[1].tobytes()
+    write_whole(path, cv2.imencode(path.suffix, picture, flat)[1].tobytes())
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file whole or not at all. Raises BadFile."""
     try:
         replace_bytes(path, data, 0o644)
     except OSError as error:
@@ -282,8 +283,4 @@ def _decoded(path: Path, data: bytes) -> Picture:
 
 
 def _save(path: Path, index: Index) -> None:
-    document = index.model_dump(by_alias=True, exclude_none=True)
-    try:
-        replace_bytes(path / INDEX, dump_mapping(document), 0o644)
-    except OSError as error:
-        raise BadFile(path / INDEX, "", f"cannot be written: {error.strerror or error}") from None
+    write_whole(path / INDEX, dump_mapping(index.model_dump(by_alias=True, exclude_none=True)))
