@@ -221,7 +221,7 @@ def nearest_lens(
         if name in LENSES and model.kind != "CAHV" and (same := as_kind(model, LENSES[name])) is not None:
             return name, same, twin_error(model, same)
     if len(lenses) > 3:  # the others are as near as one of these, or nearly so
-        lenses = tuple(one for one in lenses if one not in ("radtan", "thin_prism", "tilted"))
+        lenses = tuple(one for one in lenses if one not in ("radtan", "thin_prism"))
     problems = [""]
 
     def twins() -> Iterator[CameraModel]:
