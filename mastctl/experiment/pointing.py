@@ -145,6 +145,9 @@ def rms(pairs: Sequence[tuple[float, float]]) -> tuple[float, float] | None:
     return float(x), float(y)
 
 
+ENDING = ("stopped", "estopped", "leased")
+"""Another client has stopped the mast or steers it: no further target moves the head."""
+
 # Targets lie this far to either side of straight ahead: the pan range of the paper's calibration (III.C).
 PAN_RANGE_RAD = 1.0
 
@@ -172,7 +175,8 @@ def run_pointing_experiment(
 
     There are so many ``targets`` at each distance from the camera to the ground, from number ``first`` on,
     each with a draw of its own by ``seed``. ``on_target`` is called after each, failed or not. Of each
-    distance ``pictures`` targets keep their images for the report; ``notes`` are for its reader. Raises
+    distance ``pictures`` targets keep their images for the report; ``notes`` are for its reader. A stop by
+    another client, or its lease, ends the experiment: the record has what was measured before. Raises
     ClientError if the daemon cannot be reached or refuses for another reason than the target itself.
     """
     status = client.status()
@@ -185,12 +189,21 @@ def run_pointing_experiment(
     run = _PointingRun(client, rig, pair, status["limits"], seed, truth)
     records: list[TargetRecord] = []
     summaries = []
+    ended = ""
     for distance_m in distances_m:
+        if ended:
+            break
         distance_begun_s = _now_s(client)
         rows: list[TargetRecord] = []
         for index in range(first, first + targets):
             wanted = sum(bool(row.landed_images) for row in rows) < pictures
-            record = run.one_target(distance_m, index, wanted)
+            try:
+                record = run.one_target(distance_m, index, wanted)
+            except ClientError as error:
+                if error.code not in ENDING:
+                    raise
+                ended = f"ended before target {index} at {distance_m:g} m: {error}"
+                break
             rows.append(record)
             if on_target is not None:
                 on_target(record)
@@ -198,7 +211,7 @@ def run_pointing_experiment(
         summaries.append(summarise_distance(distance_m, rows, _now_s(client) - distance_begun_s))
     return PointingExperiment(
         url, status, seed, pair[0], aim_px, tuple(records), tuple(summaries), started,
-        _now_s(client) - begun_s, tuple(notes),
+        _now_s(client) - begun_s, (*notes, ended) if ended else tuple(notes),
     )  # fmt: skip
 
 
@@ -253,6 +266,8 @@ class _PointingRun:
             for _ in range(VIEWS_PER_TARGET):
                 target = target or views.find_target(distance_m)
         except ClientError as error:
+            if error.code in ENDING:
+                raise
             reason = f"searching a target: {error}"
         if target is not None:
             return self._point_at(target, distance_m, index, begun_s, with_pictures)
@@ -271,9 +286,13 @@ class _PointingRun:
             pixel = (target.shot.camera, target.shot.frame_id, target.x_px, target.y_px)
             operation = pointed(self.client, pixel=pixel, pointings=2)
             if operation["state"] != "done":
+                if operation["state"] in ENDING:
+                    raise ClientError(operation["state"], "the pointing was stopped")
                 reason = operation["error"] or {"code": operation["state"], "message": "stopped"}
                 error = f"{reason['code']}: {reason['message']}"
         except ClientError as refusal:
+            if refusal.code in ENDING:
+                raise
             error = f"{refusal.code}: {refusal}"
         entries = operation["pointings"] if operation is not None else []
         landings = tuple(self._landing(target, entry) for entry in entries)

@@ -8,6 +8,7 @@ import math
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -23,6 +24,7 @@ from mastctl.experiment.pointing import (
     PointingExperiment,
     TargetRecord,
     rms,
+    run_pointing_experiment,
     summarise_distance,
 )
 from mastctl.experiment.pointing_report import CSV_COLUMNS, write_pointing_report
@@ -149,6 +151,31 @@ def test_an_operation_that_takes_too_long_is_stopped_for_the_next() -> None:
         pointed(cast(Client, daemon), pan_rad=0.1, tilt_rad=0.0)
     assert pointed(cast(Client, daemon), pan_rad=0.2, tilt_rad=0.0) == {"state": "done"}
     assert daemon.calls == ["point", "stop", "point"]
+
+
+@pytest.mark.parametrize("code", ["stopped", "estopped", "leased"])
+def test_after_the_stop_of_a_person_no_target_moves_the_head(
+    code: str, repository: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moves: list[object] = []
+
+    def refuse(client: Client, **request: Any) -> dict[str, Any]:
+        moves.append(request)
+        raise ClientError(code, "a person has stopped the mast")
+
+    monkeypatch.setattr("mastctl.experiment.targets.pointed", refuse)
+    mast = (repository / "configs/masts/rocky8_simulated.yaml").read_bytes()
+    limits = {"pan_rad": [-2.6, 2.6], "tilt_rad": [-1.2, 0.5]}
+    client = SimpleNamespace(
+        url="http://127.0.0.1:1",
+        mast_file=lambda: mast,
+        simulation_time=lambda: {"speed": "1"},
+        status=lambda: {
+            "now_s": 1.0, "limits": limits, "cameras": dict.fromkeys(("navcam_left", "navcam_right")),
+        },
+    )  # fmt: skip
+    ran = run_pointing_experiment(cast(Client, client), targets=3)
+    assert len(moves) == 1 and "a person has stopped the mast" in ran.notes[0]
 
 
 def test_a_study_of_the_paper_runs_from_a_checkout(tmp_path: Path) -> None:
