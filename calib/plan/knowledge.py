@@ -157,14 +157,15 @@ STEPS = (5, 3)
 class Workspace:
     """Where a rig points: joint angles at which targets are clicked, from where to where.
 
-    ``cameras`` are the clicked one, and its partner if there is one. A ``one_sided`` head approaches every
-    goal from the same side by itself, so that backlash is no error.
+    ``cameras`` are the clicked one, and its partner if there is one; targets are ``ranges_m`` away. A
+    ``one_sided`` head approaches every goal from the same side by itself, so that backlash is no error.
     """
 
     cameras: tuple[str, ...]
     pan_rad: tuple[float, float]
     tilt_rad: tuple[float, float]
     one_sided: bool = False
+    ranges_m: tuple[float, ...] = RANGES_M
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,8 +204,11 @@ def pointing(known: Knowledge, where: Workspace) -> ExpectedPointing:
     landings: list[tuple[FloatArray, FloatArray]] = []
     places: list[tuple[float, float, float]] = []
     side = 0
-    pans, tilts = np.linspace(*where.pan_rad, STEPS[0]), np.linspace(*where.tilt_rad, STEPS[1])
-    for pan, tilt, range_m, click in product(pans.tolist(), tilts.tolist(), RANGES_M, CLICKS):
+    pans, tilts = (
+        np.unique(np.linspace(*angles, steps))
+        for angles, steps in zip((where.pan_rad, where.tilt_rad), STEPS, strict=True)
+    )
+    for pan, tilt, range_m, click in product(pans.tolist(), tilts.tolist(), where.ranges_m, CLICKS):
         # Backlash shows where click and landing were approached from different sides.
         side = 0 if where.one_sided else 1 if side != 1 else -1
         sides = (side, side), (-side, -side)

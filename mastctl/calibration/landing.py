@@ -7,6 +7,7 @@ rig. Where the target lands then is by the true one. The paper's sections IV and
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -145,17 +146,20 @@ def first_cameras(rig: Rig) -> tuple[str, ...]:
 
 
 def expected_pointing(
-    fit: FittedRig, cameras: tuple[str, ...] | None = None
+    fit: FittedRig, cameras: tuple[str, ...] | None = None, middle: bool = False
 ) -> tuple[ExpectedPointing, FloatArray] | None:
     """Return how first pointings depend on a fitted rig's numbers, and their covariance.
 
     Over the angles at which boards were seen, targets at 2, 6 and 10 m, clicked in these cameras, by default
-    the first (one camera gets the range). None if nothing can be pointed at.
+    the first (one camera gets the range); with ``middle`` only amid those angles, `POINTING_RANGE_M` away.
+    None if nothing can be pointed at.
     """
     readings = np.array([(i.pan_rad, i.tilt_rad) for i in fit.images if i.pan_rad is not None], dtype=float)
-    low, high = readings.min(axis=0).tolist(), readings.max(axis=0).tolist()
-    known = Knowledge(fit.rig, {})
-    where = Workspace(cameras or first_cameras(fit.rig), (low[0], high[0]), (low[1], high[1]))
+    known, names = Knowledge(fit.rig, {}), cameras or first_cameras(fit.rig)
+    ends = (np.median(readings, axis=0),) * 2 if middle else (readings.min(axis=0), readings.max(axis=0))
+    (low_pan, low_tilt), (high_pan, high_tilt) = (one.tolist() for one in ends)
+    where = Workspace(names, (low_pan, high_pan), (low_tilt, high_tilt))
+    where = replace(where, ranges_m=(POINTING_RANGE_M,)) if middle else where
     try:
         landings = pointing(known, where)
     except CalibError:

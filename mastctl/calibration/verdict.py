@@ -370,7 +370,7 @@ def _pointing(survey: Survey, fit: Calibration | BenchCalibration) -> Iterator[R
     joint_rad = fit.joint_rad if isinstance(fit, BenchCalibration) else survey.sigma.joint_rad
     for cameras in head_cameras(fit.rig):
         by = cameras[0].rpartition("_")[0] if len(cameras) > 1 else cameras[0]
-        expected = expected_pointing(fit, cameras)
+        expected = expected_pointing(fit, cameras, middle=isinstance(fit, Calibration))
         if expected is None:
             reason = f"pointing {by} at 2 to 10 m is not possible at the angles at which boards were seen"
             yield Reason("care", reason)

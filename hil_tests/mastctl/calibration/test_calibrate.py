@@ -109,6 +109,8 @@ def test_a_second_calibration_keeps_the_first_and_compares_with_it(
     answer = json.loads(capsys.readouterr().out)
     assert (tmp_path / "m.previous.yaml").read_bytes() == before
     assert answer["method"] == "paper"
+    (pointing,) = [one for one in answer["verdict"]["reasons"] if "a first pointing by" in one["sentence"]]
+    assert pointing["grade"] == "good", "targets 6 m away, amid the angles of the survey"
     assert answer["in_use"]["digest"] == old.digest
     change = answer["in_use"]["pointing_change"]["navcam"]
     # The old file's mast is off by 9 and 18 mrad: positions move by up to 26 px of a lens of 1290 px.
