@@ -48,7 +48,9 @@ def queue_output() -> None:
 
 
 @contextmanager
-def client_of(args: argparse.Namespace, *, default_address: bool = False) -> Iterator[Client]:
+def client_of(
+    args: argparse.Namespace, *, default_address: bool = False, timeout_s: float = 30.0
+) -> Iterator[Client]:
     """Give a client of the daemon that the options, or MASTCTL_URL, name.
 
     Where nothing names one, it is that of the packaged configuration, and a daemon of another user is only
@@ -73,7 +75,7 @@ def client_of(args: argparse.Namespace, *, default_address: bool = False) -> Ite
         url = listen.url
         if not named:
             reads_only = _not_ours(listen)
-    with Client(url, name=_person(), reads_only=reads_only) as client:
+    with Client(url, timeout_s, name=_person(), reads_only=reads_only) as client:
         client.use_lease(getattr(args, "lease", None))
         yield client
 

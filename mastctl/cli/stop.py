@@ -25,6 +25,11 @@ WITHOUT_DAEMON = (
     "or stop it with 'mastctl stop --without-daemon --config FILE'"
 )
 
+HUNG_DAEMON = (
+    "if the head moves, switch its power off, or kill the daemon's process (kill -9) and then stop the head "
+    "with 'mastctl stop --without-daemon --config FILE'"
+)
+
 
 @command(
     "stop",
@@ -109,11 +114,14 @@ def _by_any_path(
     if answer is not None:
         return answer
     from mastctl.client import ClientError
+    from mastctl.client.client import STOP_ANSWER_S
 
     try:
-        with client_of(args, default_address=True) as client:
+        with client_of(args, default_address=True, timeout_s=STOP_ANSWER_S) as client:
             return {**request(client), "reached": client.url}
     except ClientError as error:
+        if error.code == "timeout":
+            raise CommandError(error.code, f"{error}; {HUNG_DAEMON}") from None
         if error.code != "no_daemon":
             raise
         why = str(error).partition(";")[0]  # to start a daemon is no help here

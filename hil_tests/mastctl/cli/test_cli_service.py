@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import socket
 import subprocess
 import sys
 from collections.abc import Callable
@@ -192,6 +193,16 @@ def test_a_stop_without_a_daemon_says_what_else_stops_a_head(
     assert said.startswith(f"mastctl: no daemon answers at {url}; if the head moves")
     assert "mastctl stop --without-daemon" in said
     assert "starts one" not in said
+
+
+def test_a_stop_that_a_hung_daemon_takes_says_what_else_stops_a_head(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mastctl.client.client.STOP_ANSWER_S", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as hung:
+        assert main(["stop", "--url", f"http://127.0.0.1:{hung.getsockname()[1]}"]) == 1
+    said = capsys.readouterr().err
+    assert "did not answer" in said and "kill -9" in said and "mastctl stop --without-daemon" in said
 
 
 def test_the_address_comes_from_the_configuration(
