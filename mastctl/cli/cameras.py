@@ -23,12 +23,24 @@ if TYPE_CHECKING:
 
 FRAME_TIMEOUT_S = 5.0
 
+
+def _control(text: str) -> tuple[str, int | str]:
+    """Read ``CONTROL=VALUE`` (argparse ``type``)."""
+    name, _, value = text.partition("=")
+    if not name or not value:
+        raise argparse.ArgumentTypeError(f"'{text}' where CONTROL=VALUE is expected")
+    return name, int(value) if value.lstrip("-").isdecimal() else value
+
+
 CAMERA = (
     option("CAMERA", "link, node, card name or bus; with --config its name there"),
     option("--config FILE", "a configuration that has the camera"),
     option("--format CODE", "YUYV, MJPG, GREY ... (default: the first it has)"),
     option("--size W H", "default: as it is set", type=int),
     option("--rate HZ", "default: as it is set"),
+    option(
+        "--set CONTROL=VALUE", "a control; may be given often", repeat=True, type=_control, dest="controls"
+    ),
 )
 
 
@@ -239,13 +251,15 @@ def opened_camera(args: argparse.Namespace) -> Iterator[tuple[Camera, tuple[int,
             if one.bench is not None and one.bench.options_for is not None
         )
         size = None if args.size is None else tuple(args.size)
-        device = DeviceSettings(name, options_for(args.camera, args.format, size, args.rate, {}))
+        device = DeviceSettings(
+            name, options_for(args.camera, args.format, size, args.rate, dict(args.controls))
+        )
         with open_one_camera(
             HardwareSettings(DeviceSettings("none"), {args.camera: device}), args.camera
         ) as one:
             yield one, None
         return
-    for name in ("format", "size", "rate"):
+    for name in ("format", "size", "rate", "set"):
         if getattr(args, name):
             raise WrongUse(f"--{name} does not go with --config, which has it")
     config = load_config(args.config)

@@ -12,7 +12,7 @@ from mastctl.cli.main import main
 
 from .conftest import BUS
 
-SETTINGS = ["--size", "640", "480", "--rate", "25"]
+SETTINGS = ["--size", "640", "480", "--rate", "25", "--set", "timestamp_source=start_of_exposure"]
 
 
 def told(capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, object]:
