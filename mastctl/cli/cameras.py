@@ -38,9 +38,7 @@ CAMERA = (
     option("--format CODE", "YUYV, MJPG, GREY ... (default: the first it has)"),
     option("--size W H", "default: as it is set", type=int),
     option("--rate HZ", "default: as it is set"),
-    option(
-        "--set CONTROL=VALUE", "a control; may be given often", repeat=True, type=_control, dest="controls"
-    ),
+    option("--set CONTROL=VALUE", "a control; may be given often", repeat=True, type=_control),
 )
 
 
@@ -251,9 +249,7 @@ def opened_camera(args: argparse.Namespace) -> Iterator[tuple[Camera, tuple[int,
             if one.bench is not None and one.bench.options_for is not None
         )
         size = None if args.size is None else tuple(args.size)
-        device = DeviceSettings(
-            name, options_for(args.camera, args.format, size, args.rate, dict(args.controls))
-        )
+        device = DeviceSettings(name, options_for(args.camera, args.format, size, args.rate, dict(args.set)))
         with open_one_camera(
             HardwareSettings(DeviceSettings("none"), {args.camera: device}), args.camera
         ) as one:
