@@ -82,7 +82,7 @@ class PanoramaTarget:
     id: Name
     x_px: Pixel
     y_px: Pixel
-    view: Annotated[int, Field(strict=True, ge=0)] | None = None
+    view: Annotated[int, Field(strict=True, ge=0, le=1_000_000)] | None = None
     recompute: bool = False
     by_direction: bool = False
 
