@@ -20,7 +20,6 @@ a later image does not repeat (`mastctl.motion.measurement`).
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Sequence
 from typing import Any, cast
@@ -44,8 +43,6 @@ from mastctl.motion.measurement import CameraView, Clicked, match_facts, rounded
 from mastctl.motion.one_camera import OneCamera
 from mastctl.motion.requests import Aim, PixelTarget, PointingError, PointRequest, aim_of
 from mastctl.motion.steps import FoundAgain, Steps
-
-log = logging.getLogger(__name__)
 
 NO_PICTURE_OF_A_POSITION = "no residual: a position has no picture that could be looked for"
 CHANGED = (
@@ -84,7 +81,7 @@ class PointingLoop(Steps):
                 self._return_to(view_rad, request.pixel.camera)
             self._run(request)
         except BaseException as error:
-            self._stop()
+            self.stop_whatever_happened()
             if isinstance(error, (MastctlError, DriverError, CalibError)):
                 code, message = getattr(error, "code", "failed"), " ".join(str(error).split())
                 if view_rad is not None and self.last == "target":
@@ -387,13 +384,6 @@ class PointingLoop(Steps):
             "range_interval_m": None if one is None else list(one.sight.range_interval_m),
             "pointings": self._pointings,
         }
-
-    def _stop(self) -> None:
-        """Stop the mast whatever happened; what stops it must not hide why."""
-        try:
-            self._devices.stop()
-        except Exception as error:
-            log.error("the head did not confirm the stop: %s: %s", type(error).__name__, error)
 
 
 def _stereo_facts(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -32,6 +33,8 @@ from mastctl.motion.measurement import (
 )
 from mastctl.motion.requests import PixelTarget, PointingError, clicked_frame
 from mastctl.motion.settings import PointingSettings
+
+log = logging.getLogger(__name__)
 
 WATCHED_S = 0.05
 """How often a head at rest is read while a moment is waited for; a stop is noticed as soon."""
@@ -124,6 +127,13 @@ class Steps:
                 yield detail
             finally:
                 self._record, self.last = record, name
+
+    def stop_whatever_happened(self) -> None:
+        """Stop the mast whatever happened; what stops it must not hide why."""
+        try:
+            self._devices.stop()
+        except Exception as error:
+            log.error("the head did not confirm the stop: %s: %s", type(error).__name__, error)
 
     def check_not_stopped(self) -> None:
         """Pass unless the request was cancelled. Raises PointingError ``stopped``."""

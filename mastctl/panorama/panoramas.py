@@ -130,7 +130,7 @@ class Panoramas:
         now = datetime.now(UTC)
         return Index(
             schema=SCHEMA,
-            id=f"{now:%Y%m%d-%H%M%S}-{secrets.token_hex(2)}",
+            id=f"{now:%Y%m%d-%H%M%S-%f}-{secrets.token_hex(2)}",
             time=now.isoformat(timespec="seconds"),
             cameras=cameras,
             mast_digest=digest,

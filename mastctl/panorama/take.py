@@ -110,7 +110,7 @@ class PanoramaTaker(Steps):
                 detail.update(seams=None if whole is None else whole.model_dump())
                 detail.update(slip=None if slip is None else slip.sentence)
         except BaseException as error:
-            devices.stop()
+            self.stop_whatever_happened()
             end = {"state": "ended", "reason": " ".join(str(error).split()) or type(error).__name__}
             with suppress(BadFile):  # of a full disk; the error says so already
                 folder.save(folder.index.model_copy(update=end))

@@ -245,10 +245,11 @@ def test_a_stop_ends_the_composition_and_resume_composes(
     assert record["state"] == "done" and "mosaic" in index
 
 
-def test_a_camera_that_is_gone_ends_it_and_nothing_is_lost(client: Client) -> None:
-    client.set_fault("navcam_left", "off")
+@pytest.mark.parametrize("device", ["navcam_left", "pan_tilt"])
+def test_a_device_that_is_gone_ends_it_and_nothing_is_lost(client: Client, device: str) -> None:
+    client.set_fault(device, "off")
     record, index = taken(client)
-    assert record["state"] == "failed" and "navcam_left" in record["error"]["message"]
+    assert (record["state"], index["state"]) == ("failed", "ended") and device in index["reason"]
     assert sum(view["state"] == "missing" for view in index["views"]) == 3
     client.clear_faults()
     record, index = taken(client, resume=index["id"])
@@ -256,14 +257,13 @@ def test_a_camera_that_is_gone_ends_it_and_nothing_is_lost(client: Client) -> No
 
 
 def test_a_full_disk_ends_it_in_a_sentence(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = replace_bytes
     is_full: list[Path] = []
 
     def full(path: Path, data: bytes, mode: int = 0o600) -> None:
         if path.name.startswith("002-") or is_full:
             is_full.append(path)
             raise OSError(28, "No space left on device")
-        whole(path, data, mode)
+        replace_bytes(path, data, mode)
 
     monkeypatch.setattr("mastctl.panorama.folder.replace_bytes", full)
     record, index = taken(client)
