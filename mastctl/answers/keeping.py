@@ -11,15 +11,15 @@ from typing_extensions import TypedDict
 
 from mastctl.answers.status import (
     Angles,
-    CalibrationTold,
+    CalibrationAnswer,
     Count,
-    MastTold,
+    MastAnswer,
     Pixel,
     Point,
     Quaternion,
     Role,
     Seconds,
-    SentinelTold,
+    SentinelAnswer,
 )
 
 RecordingKind = Literal["run", "kept", "ring"]
@@ -143,7 +143,7 @@ class CountedPointing(MeasuredPointing):
     chi_square: float
 
 
-class ResidualVerdict(CalibrationTold):
+class ResidualVerdict(CalibrationAnswer):
     """The verdict of residuals alone, with its figures.
 
     ``times_expected``: residuals over what is expected, rms, all that is common taken out.
@@ -162,7 +162,7 @@ class CalibrationReport(ResidualVerdict):
 
     write_error: str | None
     newest: list[CountedPointing]
-    sentinel: SentinelTold | None
+    sentinel: SentinelAnswer | None
 
 
 class RecordingListed(TypedDict):
@@ -227,8 +227,8 @@ class PlaceList(TypedDict):
 class MastChange(TypedDict):
     """``POST /mast``: the mast file in use, and the one before it."""
 
-    mast: MastTold
-    former_mast: MastTold | None
+    mast: MastAnswer
+    former_mast: MastAnswer | None
 
 
 class ConfigChange(TypedDict):
@@ -243,7 +243,7 @@ class ReloadResult(TypedDict):
     """``POST /reload``: what changed, the mast file in use, and sentences that say what to know of it."""
 
     changed: list[ConfigChange]
-    mast: MastTold
+    mast: MastAnswer
     notes: list[str]
 
 
@@ -312,17 +312,17 @@ class FaultParameter(TypedDict):
     most: float | None
 
 
-class FaultWord(TypedDict):
+class FaultKind(TypedDict):
     """A fault word: its effect, in one sentence, and its parameters; the unit is in the name."""
 
     effect: str
     parameters: dict[str, FaultParameter]
 
 
-class FaultWordList(TypedDict):
+class FaultKinds(TypedDict):
     """The fault words of each simulated device."""
 
-    devices: dict[str, dict[str, FaultWord]]
+    devices: dict[str, dict[str, FaultKind]]
 
 
 class PointTruth(TypedDict):

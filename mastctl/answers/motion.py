@@ -13,21 +13,21 @@ from mastctl.answers.bench import BenchRunRecord
 from mastctl.answers.status import (
     Angles,
     Count,
-    ErrorTold,
-    EstopHeld,
-    FaultTold,
+    ErrorAnswer,
+    EstopCause,
+    FaultAnswer,
     Json,
-    LeaseTold,
-    MastTold,
+    LeaseAnswer,
+    MastAnswer,
     MaybePixel,
     MeasuredJoints,
     OperationState,
     Pixel,
     Point,
-    PoseTold,
+    PoseAnswer,
     Role,
     Seconds,
-    StandingTold,
+    StateFacts,
     TrackState,
 )
 
@@ -100,13 +100,13 @@ class OperationListed(PointingResult):
     created_s: float
     started_s: float | None
     ended_s: float | None
-    error: ErrorTold | None
+    error: ErrorAnswer | None
     residual_px: MaybePixel | None
     residual_sigma_px: MaybePixel | None
     ended_because: NotRequired[str | None]
 
 
-class OperationTold(OperationListed):
+class OperationAnswer(OperationListed):
     """``GET /operations/{id}``: the same with its steps."""
 
     steps: list[Step]
@@ -177,14 +177,14 @@ class JogAnswer(TypedDict):
     held: dict[str, str]
 
 
-class StopTold(TypedDict):
+class StopAnswer(TypedDict):
     """``POST /stop``: the head has confirmed it; the operation that was stopped with it."""
 
     stopped: Literal[True]
     operation: str | None
 
 
-class EstopTold(EstopHeld):
+class EstopAnswer(EstopCause):
     """``POST /estop``: confirmed. ``kept``: a restart would find it; else ``message`` says why not."""
 
     stopped: Literal[True]
@@ -194,11 +194,11 @@ class EstopTold(EstopHeld):
     message: NotRequired[str | None]
 
 
-class ResetTold(TypedDict):
+class ResetAnswer(TypedDict):
     """``POST /reset``: the first cause of the latch that was released, and whether one came since."""
 
     latched: bool
-    released: EstopHeld
+    released: EstopCause
 
 
 class CameraPixel(TypedDict):
@@ -224,7 +224,7 @@ class Handover(TypedDict):
     range_m: float
 
 
-class OffsetTold(TypedDict):
+class OffsetAnswer(TypedDict):
     """The offset, beyond chance, of hand-offs from ``source`` to ``camera``: found less predicted."""
 
     source: str
@@ -241,10 +241,10 @@ class SelfCheck(TypedDict):
     """How the mast file in use agrees with the hand-offs."""
 
     handoffs: Count
-    offsets: list[OffsetTold]
+    offsets: list[OffsetAnswer]
 
 
-class TrackStands(TypedDict):
+class TrackFacts(TypedDict):
     """How a track stands, without what its hand-offs say of the mast file."""
 
     sequence: Count
@@ -266,11 +266,11 @@ class TrackStands(TypedDict):
     position_m: Point | None
     position_in_site_m: Point | None
     covariance_m2: Annotated[list[Point], Len(3, 3)] | None
-    pose: PoseTold | None
+    pose: PoseAnswer | None
     age_s: Seconds
 
 
-class TrackTold(TrackStands):
+class TrackAnswer(TrackFacts):
     """``GET /track``, and each event of ``GET /track/stream``."""
 
     self_check: SelfCheck
@@ -280,23 +280,23 @@ class PoseTaken(TypedDict):
     """``POST /pose``: the look that follows, if one does, and the track."""
 
     operation: str | None
-    track: TrackTold
+    track: TrackAnswer
 
 
-class HeadTold(MeasuredJoints):
+class HeadAnswer(MeasuredJoints):
     """A reading of the head."""
 
     moving: bool
 
 
-class StateTold(StandingTold):
+class StateAnswer(StateFacts):
     """The daemon's state; ``track`` is the id of the active one."""
 
     track: str | None
     moving: bool
 
 
-class FrameTold(TypedDict):
+class FrameAnswer(TypedDict):
     """The facts of a camera's newest frame, without its picture."""
 
     frame_id: str
@@ -316,7 +316,7 @@ class FrameTold(TypedDict):
     age_s: Seconds
 
 
-class CommandTold(TypedDict):
+class CommandAnswer(TypedDict):
     """A command as it is recorded, or (``ended``) how the operation ended that it began."""
 
     number: Count
@@ -350,63 +350,63 @@ class StateEvent(_Event):
     """The state changed."""
 
     topic: Literal["state"]
-    value: StateTold
+    value: StateAnswer
 
 
 class JointsEvent(_Event):
     """The head was read."""
 
     topic: Literal["joints"]
-    value: HeadTold
+    value: HeadAnswer
 
 
 class OperationEvent(_Event):
     """An operation began, made a step, or ended; ``key`` is its id."""
 
     topic: Literal["operation"]
-    value: OperationTold
+    value: OperationAnswer
 
 
 class TrackEvent(_Event):
     """The track changed."""
 
     topic: Literal["track"]
-    value: TrackTold
+    value: TrackAnswer
 
 
 class FaultEvent(_Event):
     """All that is wrong with one device now; ``key`` is its name."""
 
     topic: Literal["fault"]
-    value: list[FaultTold]
+    value: list[FaultAnswer]
 
 
 class FrameEvent(_Event):
     """A camera took a picture; ``key`` is its name."""
 
     topic: Literal["frame"]
-    value: FrameTold
+    value: FrameAnswer
 
 
 class MastEvent(_Event):
     """Another mast file is in use."""
 
     topic: Literal["mast"]
-    value: MastTold
+    value: MastAnswer
 
 
 class CommandEvent(_Event):
     """A command was carried out or refused, or what it began has ended."""
 
     topic: Literal["command"]
-    value: CommandTold
+    value: CommandAnswer
 
 
 class LeaseEvent(_Event):
     """The lease changed hands, or was renewed."""
 
     topic: Literal["lease"]
-    value: LeaseTold
+    value: LeaseAnswer
 
 
 class BenchEvent(_Event):

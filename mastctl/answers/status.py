@@ -9,11 +9,11 @@ from typing_extensions import TypedDict  # that of `typing` is not described bef
 
 Role = Literal["view", "operate", "admin"]
 """Each may do what those before it may: view only reads, operate drives the rover, admin sets it up."""
-Word = Literal[
+ServiceState = Literal[
     "starting", "ready", "moving", "tracking", "holding", "stopping", "stopped", "fault", "closing"
 ]
 """The daemon's state."""
-WELL: frozenset[Word] = frozenset({"ready", "moving", "tracking", "holding"})
+WELL: frozenset[ServiceState] = frozenset({"ready", "moving", "tracking", "holding"})
 """States in which a command is carried out."""
 OperationState = Literal["queued", "running", "done", "failed", "stopped"]
 TrackState = Literal["idle", "starting", "tracking", "lost", "stopped"]
@@ -33,7 +33,7 @@ Count = Annotated[int, Ge(0)]
 Json = dict[str, Any]
 
 
-class ErrorTold(TypedDict):
+class ErrorAnswer(TypedDict):
     """Why something was refused: a word for programs, a sentence for people, more where there is more."""
 
     code: str
@@ -44,10 +44,10 @@ class ErrorTold(TypedDict):
 class ErrorBody(TypedDict):
     """Every answer that is not a success."""
 
-    error: ErrorTold
+    error: ErrorAnswer
 
 
-class LiveTold(TypedDict):
+class LiveAnswer(TypedDict):
     """``GET /health/live``.
 
     ``token_folder``: where the daemon reads its tokens, for a caller on its own machine, if it requires any.
@@ -57,11 +57,11 @@ class LiveTold(TypedDict):
     token_folder: NotRequired[str]
 
 
-class ReadyTold(TypedDict):
+class ReadyAnswer(TypedDict):
     """``GET /health/ready`` where commands are carried out: the state with its reason."""
 
     ready: Literal[True]
-    state: Word
+    state: ServiceState
     reason: str
 
 
@@ -82,14 +82,14 @@ class MeasuredJoints(TypedDict):
     age_s: Seconds
 
 
-class AxisTold(TypedDict):
+class AxisAnswer(TypedDict):
     """How an axis of the head moves; ``count_rad`` null where unknown."""
 
     count_rad: float | None
     one_sided: bool
 
 
-class BoxTold(TypedDict):
+class BoxAnswer(TypedDict):
     """Where the head must not be: [lowest, highest] of each joint, radians."""
 
     name: str
@@ -105,7 +105,7 @@ class SoftLimits(TypedDict):
     speed_rad_per_s: float
     margin_rad: float
     acceleration_rad_per_s2: float | None
-    keep_out: list[BoxTold]
+    keep_out: list[BoxAnswer]
 
 
 class Sun(TypedDict):
@@ -118,14 +118,14 @@ class Sun(TypedDict):
     active: bool
 
 
-class SunTold(TypedDict):
+class SunAnswer(TypedDict):
     """``GET /limits/sun``; null where none was stated. ``boxes``: joint angles within its cone."""
 
     sun: Sun | None
-    boxes: list[BoxTold]
+    boxes: list[BoxAnswer]
 
 
-class CameraTold(TypedDict):
+class CameraAnswer(TypedDict):
     """A camera's newest frame; all null before the first."""
 
     frame_id: str | None
@@ -134,7 +134,7 @@ class CameraTold(TypedDict):
     age_s: Seconds | None
 
 
-class CameraSettingTold(TypedDict):
+class CameraSettingAnswer(TypedDict):
     """A setting of a camera: ``value`` null if not known, ``step`` 0 for any value between the bounds,
     ``refusal`` why it cannot be changed, null if it can."""
 
@@ -148,7 +148,7 @@ class CameraSettingTold(TypedDict):
     refusal: str | None
 
 
-class SensorModeTold(TypedDict):
+class SensorModeAnswer(TypedDict):
     """Which pixels of its sensor a camera's pictures show; ``crop_px`` is x, y, width, height. It and
     ``sensor_px`` are null if they are not known."""
 
@@ -158,7 +158,7 @@ class SensorModeTold(TypedDict):
     flip: Literal["none", "horizontal", "vertical", "both"]
 
 
-class CameraSettingsTold(TypedDict):
+class CameraSettingsAnswer(TypedDict):
     """The settings of a camera that can change; ``held``: an operation keeps them as they are.
 
     ``sensor_mode``: of the camera as it was opened, null where it does not know it.
@@ -167,13 +167,13 @@ class CameraSettingsTold(TypedDict):
     """
 
     camera: str
-    settings: list[CameraSettingTold]
+    settings: list[CameraSettingAnswer]
     held: bool
-    sensor_mode: SensorModeTold | None
+    sensor_mode: SensorModeAnswer | None
     notes: list[str]
 
 
-class FaultTold(TypedDict):
+class FaultAnswer(TypedDict):
     """A fault of a device in plain words, since when, and the event that ends it."""
 
     device: str
@@ -183,7 +183,7 @@ class FaultTold(TypedDict):
     for_s: Seconds
 
 
-class PoseTold(TypedDict):
+class PoseAnswer(TypedDict):
     """Where the rover stands in the site; ``time_s`` by the sender's clock."""
 
     position_m: Point
@@ -192,7 +192,7 @@ class PoseTold(TypedDict):
     age_s: Seconds
 
 
-class TrackWord(TypedDict):
+class TrackBrief(TypedDict):
     """The track in a word."""
 
     state: TrackState
@@ -200,7 +200,7 @@ class TrackWord(TypedDict):
     id: str | None
 
 
-class MastTold(TypedDict):
+class MastAnswer(TypedDict):
     """A mast file: its name on disk, the mast's, and the SHA-256 of its bytes."""
 
     file: str
@@ -208,7 +208,7 @@ class MastTold(TypedDict):
     digest: str
 
 
-class SentinelTold(TypedDict):
+class SentinelAnswer(TypedDict):
     """``GET /sentinel``: what its looks say together; ``none`` without a reference.
 
     ``reference``, ``last_look`` and ``since`` (of a change) as ISO 8601.
@@ -223,7 +223,7 @@ class SentinelTold(TypedDict):
     reference: str | None
 
 
-class CalibrationTold(TypedDict):
+class CalibrationAnswer(TypedDict):
     """Whether the mast file still holds, by residuals, reference pictures and hand-offs; ``since`` (ISO 8601,
     UTC) where it does not."""
 
@@ -241,7 +241,7 @@ class LastResidual(TypedDict):
     operation: str
 
 
-class ControlTold(TypedDict):
+class ControlAnswer(TypedDict):
     """The client that steers, by a lease or an operation; ``until`` by the wall clock, null while it runs."""
 
     holder: str
@@ -250,10 +250,10 @@ class ControlTold(TypedDict):
     until: str | None
 
 
-class LeaseTold(TypedDict):
+class LeaseAnswer(TypedDict):
     """``GET /lease``: the client that steers, or null."""
 
-    control: ControlTold | None
+    control: ControlAnswer | None
 
 
 class LeaseRuns(TypedDict):
@@ -270,7 +270,7 @@ class LeaseGranted(LeaseRuns):
     lease_id: str
 
 
-class EstopHeld(TypedDict):
+class EstopCause(TypedDict):
     """The emergency stop that is latched: why, by whom, when (ISO 8601, UTC)."""
 
     reason: str
@@ -278,38 +278,38 @@ class EstopHeld(TypedDict):
     at: str
 
 
-class StandingTold(TypedDict):
+class StateFacts(TypedDict):
     """The daemon's state: its word, the reason, since when, and the facts it rests on."""
 
-    state: Word
+    state: ServiceState
     reason: str
     state_for_s: Seconds
     operation: str | None
     target: Json | None
     last_residual: LastResidual | None
-    estop: EstopHeld | None
-    estops: list[EstopHeld]
+    estop: EstopCause | None
+    estops: list[EstopCause]
 
 
-class Status(StandingTold):
+class Status(StateFacts):
     """``GET /status``."""
 
     simulated: bool
     hardware: str
     moving: bool
     joints: MeasuredJoints | None
-    axes: dict[str, AxisTold]
+    axes: dict[str, AxisAnswer]
     limits: SoftLimits
-    pose: PoseTold | None
-    track: TrackWord
-    control: ControlTold | None
+    pose: PoseAnswer | None
+    track: TrackBrief
+    control: ControlAnswer | None
     stop_socket: str | None
-    calibration: CalibrationTold | None
-    sentinel: SentinelTold | None
-    cameras: dict[str, CameraTold]
-    faults: list[FaultTold]
-    mast: MastTold
-    former_mast: MastTold | None
+    calibration: CalibrationAnswer | None
+    sentinel: SentinelAnswer | None
+    cameras: dict[str, CameraAnswer]
+    faults: list[FaultAnswer]
+    mast: MastAnswer
+    former_mast: MastAnswer | None
     version: str
     now_s: float
     uptime_s: Seconds

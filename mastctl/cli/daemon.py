@@ -19,7 +19,7 @@ from mastctl.cli.options import option
 from mastctl.cli.output import WrongUse
 
 if TYPE_CHECKING:
-    from mastctl.answers import OperationTold, Step
+    from mastctl.answers import OperationAnswer, Step
     from mastctl.client import Client
     from mastctl.config import Listen
 
@@ -118,7 +118,7 @@ def _person() -> str:
         return f"{os.getuid()}@{socket.gethostname()}"
 
 
-def followed(client: Client, operation_id: str, as_json: bool, timeout_s: float) -> OperationTold:
+def followed(client: Client, operation_id: str, as_json: bool, timeout_s: float) -> OperationAnswer:
     """Wait for an operation, and show its steps to a person meanwhile."""
     if as_json:
         return client.wait(operation_id, timeout_s)

@@ -14,7 +14,7 @@ from mastctl.cli.requests import TRACK
 from mastctl.cli.service import operation_shown, show_each
 
 if TYPE_CHECKING:
-    from mastctl.answers import OperationTold, TrackTold
+    from mastctl.answers import OperationAnswer, TrackAnswer
     from mastctl.client import Client
 
 POLL_S = 0.05  # how often it is checked that the daemon still takes the heartbeats
@@ -134,7 +134,7 @@ def _pixel(option: str, texts: list[str]) -> list[float]:
         raise WrongUse(f"{option}: {error}") from None
 
 
-def _done(args: argparse.Namespace, client: Client, operation_id: str) -> OperationTold:
+def _done(args: argparse.Namespace, client: Client, operation_id: str) -> OperationAnswer:
     """Wait for an operation that has to end as done. Raises CommandError with its error."""
     record = followed(client, operation_id, args.json, args.timeout)
     if record["state"] == "done":
@@ -232,5 +232,5 @@ def _measured(args: argparse.Namespace, client: Client, operation_id: str | None
     return _track(client.wait_track(operation_id, args.timeout))
 
 
-def _track(track: TrackTold) -> Answer:
+def _track(track: TrackAnswer) -> Answer:
     return Answer(track, cell(chosen(track, TRACK)))

@@ -22,25 +22,25 @@ class Calls:
         """
         return self.daemon.command(answers.ReloadResult, "POST", "/reload")
 
-    def live(self) -> answers.LiveTold:
+    def live(self) -> answers.LiveAnswer:
         """Return that the daemon answers; needs no token."""
-        return self.daemon.json(answers.LiveTold, "GET", "/health/live")
+        return self.daemon.json(answers.LiveAnswer, "GET", "/health/live")
 
     def calibration_health(self) -> answers.CalibrationReport:
         """Return whether residuals of the last days are as the mast file predicts, with the figures."""
         return self.daemon.json(answers.CalibrationReport, "GET", "/calibration/health")
 
-    def sentinel(self) -> answers.SentinelTold:
+    def sentinel(self) -> answers.SentinelAnswer:
         """Return what the drift sentinel in the daemon's state folder has found, and how long ago."""
-        return self.daemon.json(answers.SentinelTold, "GET", "/sentinel")
+        return self.daemon.json(answers.SentinelAnswer, "GET", "/sentinel")
 
     def rig(self) -> answers.RigSummary:
         """Return the configured cameras by the mast file in use: the direction and the field of each."""
         return self.daemon.json(answers.RigSummary, "GET", "/rig")
 
-    def camera_settings(self, camera: str) -> answers.CameraSettingsTold:
+    def camera_settings(self, camera: str) -> answers.CameraSettingsAnswer:
         """Return what of a camera can be changed: ``settings`` with bounds, and whether they are ``held``."""
-        return self.daemon.json(answers.CameraSettingsTold, "GET", f"/cameras/{escaped(camera)}/settings")
+        return self.daemon.json(answers.CameraSettingsAnswer, "GET", f"/cameras/{escaped(camera)}/settings")
 
     def set_camera(
         self,
@@ -50,7 +50,7 @@ class Calls:
         gain: float | None = None,
         white_balance_k: float | None = None,
         focus: float | None = None,
-    ) -> answers.CameraSettingsTold:
+    ) -> answers.CameraSettingsAnswer:
         """Change some of a camera's settings and return all as they are then.
 
         The automatic of each is turned off. ``notes`` has a sentence for each that became another value. They
@@ -59,7 +59,7 @@ class Calls:
         """
         body = given(exposure_s=exposure_s, gain=gain, white_balance_k=white_balance_k, focus=focus)
         path = f"/cameras/{escaped(camera)}/settings"
-        return self.daemon.command(answers.CameraSettingsTold, "PATCH", path, body)
+        return self.daemon.command(answers.CameraSettingsAnswer, "PATCH", path, body)
 
     def bench(self) -> answers.BenchRuns:
         """Return the bench calibration at work or the last one (``run``), and those that are kept."""
@@ -161,9 +161,9 @@ class Calls:
         """Forget a place; return those that are left. Raises ClientError ``place_unknown``."""
         return self.daemon.command(answers.PlaceList, "DELETE", f"/places/{escaped(name)}")["places"]
 
-    def sun(self) -> answers.SunTold:
+    def sun(self) -> answers.SunAnswer:
         """Return the direction that no head camera looks into: ``sun``, null where none was stated."""
-        return self.daemon.json(answers.SunTold, "GET", "/limits/sun")
+        return self.daemon.json(answers.SunAnswer, "GET", "/limits/sun")
 
     def keep_off_sun(
         self,
@@ -173,7 +173,7 @@ class Calls:
         *,
         frame: Literal["site", "rover"] = "site",
         valid_s: float | None = None,
-    ) -> answers.SunTold:
+    ) -> answers.SunAnswer:
         """Say where the sun stands: azimuth from north over east (forward over right), elevation up.
 
         ``half_angle_rad``: how near a head camera's axis may come; ``valid_s``: how long that holds, seconds,
@@ -186,11 +186,11 @@ class Calls:
             frame=frame,
             valid_s=valid_s,
         )
-        return self.daemon.command(answers.SunTold, "POST", "/limits/sun", body)
+        return self.daemon.command(answers.SunAnswer, "POST", "/limits/sun", body)
 
-    def forget_sun(self) -> answers.SunTold:
+    def forget_sun(self) -> answers.SunAnswer:
         """Keep the head off no sun any more."""
-        return self.daemon.command(answers.SunTold, "DELETE", "/limits/sun")
+        return self.daemon.command(answers.SunAnswer, "DELETE", "/limits/sun")
 
     def session(self) -> answers.ClientSession:
         """Return this client's ``name``, ``role`` and ``via``, and whether the daemon requires a token."""
@@ -337,9 +337,9 @@ class Calls:
         query = given(frame_id=frame_id, x_px=x_px, y_px=y_px, x_m=x_m, y_m=y_m, z_m=z_m)
         return self.daemon.json(answers.PointTruth, "GET", "/simulation/truth", params=query)
 
-    def fault_words(self) -> dict[str, dict[str, answers.FaultWord]]:
+    def fault_words(self) -> dict[str, dict[str, answers.FaultKind]]:
         """Return the fault words of each simulated device: each one's ``effect``, and its ``parameters``."""
-        return self.daemon.json(answers.FaultWordList, "GET", "/simulation/words")["devices"]
+        return self.daemon.json(answers.FaultKinds, "GET", "/simulation/words")["devices"]
 
     def faults(self) -> list[answers.FaultSet]:
         """Return the faults that are switched on in a simulated rover."""

@@ -159,7 +159,7 @@ class Client(LeaseCalls, Calls):
     ) -> str:
         return self.daemon.command(answers.Started, "POST", path, body, key=key, deadline_s=deadline_s)["id"]
 
-    def turn(self, pan_rad: float, tilt_rad: float, timeout_s: float = 90.0) -> answers.OperationTold:
+    def turn(self, pan_rad: float, tilt_rad: float, timeout_s: float = 90.0) -> answers.OperationAnswer:
         """Turn to joint angles as the head reads them; return the operation's record when it has ended.
 
         A turn that this program cannot follow any more, or whose time is over, is stopped. ``timeout_s`` is
@@ -196,29 +196,29 @@ class Client(LeaseCalls, Calls):
         body = _target(pixel, None, None, aim, range_m, plane)
         return self.daemon.json(answers.Preview, "POST", "/point/preview", json=body)
 
-    def operation(self, operation_id: str, timeout_s: float | None = None) -> answers.OperationTold:
+    def operation(self, operation_id: str, timeout_s: float | None = None) -> answers.OperationAnswer:
         """Return an operation's record; ``timeout_s`` as of `status`."""
         return self.daemon.json(
-            answers.OperationTold, "GET", f"/operations/{escaped(operation_id)}", within_s=timeout_s
+            answers.OperationAnswer, "GET", f"/operations/{escaped(operation_id)}", within_s=timeout_s
         )
 
     def operations(self) -> list[answers.OperationListed]:
         """Return the newest operations, newest first, without their steps."""
         return self.daemon.json(answers.Operations, "GET", "/operations")["operations"]
 
-    def stop_operation(self, operation_id: str) -> answers.OperationTold:
+    def stop_operation(self, operation_id: str) -> answers.OperationAnswer:
         """Stop the mast and one operation, if it still runs; what another client began goes on.
 
         Returns its record, which may not have ended yet.
         """
-        return self.daemon.json(answers.OperationTold, "POST", f"/operations/{escaped(operation_id)}/stop")
+        return self.daemon.json(answers.OperationAnswer, "POST", f"/operations/{escaped(operation_id)}/stop")
 
     def wait(
         self,
         operation_id: str,
         timeout_s: float = 60.0,
         on_step: Callable[[answers.Step], None] | None = None,
-    ) -> answers.OperationTold:
+    ) -> answers.OperationAnswer:
         """Wait until an operation has ended (done, failed or stopped) and return its record.
 
         ``on_step`` is called with each step as it comes. Raises ClientError ``timeout`` if it has not ended
@@ -241,8 +241,8 @@ class Client(LeaseCalls, Calls):
         self,
         *states: str,
         timeout_s: float = 60.0,
-        on_change: Callable[[answers.Status | answers.StateTold], None] | None = None,
-    ) -> answers.Status | answers.StateTold:
+        on_change: Callable[[answers.Status | answers.StateAnswer], None] | None = None,
+    ) -> answers.Status | answers.StateAnswer:
         """Wait until the daemon's state is one of these; return it with what goes with it in the status.
 
         ``on_change`` is called with the same at the beginning and at each change. Raises ClientError
@@ -267,17 +267,17 @@ class Client(LeaseCalls, Calls):
             if event is not None:
                 yield cast(answers.Event, event)
 
-    def stop(self) -> answers.StopTold:
+    def stop(self) -> answers.StopAnswer:
         """Stop the mast and the running operation."""
-        return self.daemon.json(answers.StopTold, "POST", "/stop")
+        return self.daemon.json(answers.StopAnswer, "POST", "/stop")
 
-    def estop(self, *, reason: str | None = None, name: str | None = None) -> answers.EstopTold:
+    def estop(self, *, reason: str | None = None, name: str | None = None) -> answers.EstopAnswer:
         """Stop the mast and let nothing move it until `reset`; ``kept`` says whether a restart would know."""
-        return self.daemon.json(answers.EstopTold, "POST", "/estop", json=given(reason=reason, name=name))
+        return self.daemon.json(answers.EstopAnswer, "POST", "/estop", json=given(reason=reason, name=name))
 
-    def reset(self, *, reason: str, name: str) -> answers.ResetTold:
+    def reset(self, *, reason: str, name: str) -> answers.ResetAnswer:
         """Release the emergency stop; a later command moves again."""
-        return self.daemon.json(answers.ResetTold, "POST", "/reset", json={"reason": reason, "name": name})
+        return self.daemon.json(answers.ResetAnswer, "POST", "/reset", json={"reason": reason, "name": name})
 
     def pose(
         self,
@@ -307,9 +307,9 @@ class Client(LeaseCalls, Calls):
         )
         return self.daemon.json(answers.PoseTaken, "POST", "/pose", json=body)
 
-    def track(self, timeout_s: float | None = None) -> answers.TrackTold:
+    def track(self, timeout_s: float | None = None) -> answers.TrackAnswer:
         """Return the track as it is; ``timeout_s`` as of `status`."""
-        return self.daemon.json(answers.TrackTold, "GET", "/track", within_s=timeout_s)
+        return self.daemon.json(answers.TrackAnswer, "GET", "/track", within_s=timeout_s)
 
     def start_track(
         self,
@@ -332,7 +332,7 @@ class Client(LeaseCalls, Calls):
         operation_id: str | None,
         timeout_s: float = 60.0,
         on_step: Callable[[answers.Step], None] | None = None,
-    ) -> answers.TrackTold:
+    ) -> answers.TrackAnswer:
         """Wait until a start or a look of the track has ended; return the track after it.
 
         ``None`` for the operation returns the track as it is. Raises ClientError as `wait`.
@@ -344,15 +344,15 @@ class Client(LeaseCalls, Calls):
                 return track
         raise ClientError("timeout", f"the track did not take up operation {operation_id}")
 
-    def watch_track(self) -> Generator[answers.TrackTold, None, None]:
+    def watch_track(self) -> Generator[answers.TrackAnswer, None, None]:
         """Yield the track as it is, and again at each change, until the daemon ends."""
         for track in self.daemon.heard("/track/stream"):
             if track is not None:
-                yield cast(answers.TrackTold, track)
+                yield cast(answers.TrackAnswer, track)
 
-    def stop_track(self) -> answers.TrackTold:
+    def stop_track(self) -> answers.TrackAnswer:
         """End the track; return it as it is then."""
-        return self.daemon.json(answers.TrackTold, "POST", "/track/stop")
+        return self.daemon.json(answers.TrackAnswer, "POST", "/track/stop")
 
     def jog(self) -> Jog:
         """Return a context in which the head turns at rates; it sends the heartbeats itself.

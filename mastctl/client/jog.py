@@ -102,6 +102,6 @@ class Jog:
         until_s = time.monotonic() + ANSWER_S
         while time.monotonic() < until_s:
             path = f"/operations/{escaped(jog)}"
-            if self._daemon.json(answers.OperationTold, "GET", path)["state"] not in ("queued", "running"):
+            if self._daemon.json(answers.OperationAnswer, "GET", path)["state"] not in ("queued", "running"):
                 return
             time.sleep(POLL_S)

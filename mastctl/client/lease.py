@@ -41,7 +41,7 @@ class HeldLease:
         self._thread.join()
         if self.lost is None:
             with contextlib.suppress(ClientError):
-                self._daemon.json(answers.LeaseTold, "DELETE", "/lease")
+                self._daemon.json(answers.LeaseAnswer, "DELETE", "/lease")
         self._daemon.close()
 
     def _renew(self) -> None:
@@ -92,9 +92,9 @@ class LeaseCalls:
             self.daemon.lease_id = before
             lease.end()
 
-    def control(self) -> answers.ControlTold | None:
+    def control(self) -> answers.ControlAnswer | None:
         """Return the client that steers, or None."""
-        return self.daemon.json(answers.LeaseTold, "GET", "/lease")["control"]
+        return self.daemon.json(answers.LeaseAnswer, "GET", "/lease")["control"]
 
     def acquire_lease(
         self,
@@ -122,4 +122,4 @@ class LeaseCalls:
 
     def release_lease(self) -> None:
         """Release the lease in use."""
-        self.daemon.command(answers.LeaseTold, "DELETE", "/lease")
+        self.daemon.command(answers.LeaseAnswer, "DELETE", "/lease")

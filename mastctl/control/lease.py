@@ -22,7 +22,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Literal
 
 from drivers.clock import Clock
-from mastctl.answers import ControlTold, LeaseRuns, Role
+from mastctl.answers import ControlAnswer, LeaseRuns, Role
 from mastctl.errors import BadRequest, NotAllowed, NotNow, one_line
 
 log = logging.getLogger(__name__)
@@ -128,7 +128,7 @@ class Steerer:
     kind: Literal["lease", "operation"]
     until_s: float | None = None
 
-    def as_json(self, now_s: float) -> ControlTold:
+    def as_json(self, now_s: float) -> ControlAnswer:
         """Return it as JSON: what is left in seconds, and when that is by the wall clock (UTC)."""
         left_s = None if self.until_s is None else max(0.0, self.until_s - now_s)
         until = None if left_s is None else _by_the_wall(left_s)
@@ -181,7 +181,7 @@ class LeaseTable:
         party = under_way or (self._party if self._running() else None)
         return None if party is None else Steerer(party, "operation")
 
-    def as_json(self) -> ControlTold | None:
+    def as_json(self) -> ControlAnswer | None:
         """Return the client that steers as ``GET /status`` has it."""
         control = self.control()
         return None if control is None else control.as_json(self._clock.now_s())

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from drivers.clock import Clock
-from mastctl.answers import EstopHeld, FaultTold, StandingTold, StateTold, Word
+from mastctl.answers import EstopCause, FaultAnswer, ServiceState, StateAnswer, StateFacts
 from mastctl.as_json import as_json
 from mastctl.control.publisher import Publisher
 from mastctl.errors import MastctlError, NotNow, Unable
@@ -32,7 +32,7 @@ class StandingFault:
     since_s: float
     until: str
 
-    def as_json(self, now_s: float) -> FaultTold:
+    def as_json(self, now_s: float) -> FaultAnswer:
         """Return it as JSON at a moment."""
         return {
             "device": self.device,
@@ -74,7 +74,7 @@ class Latched:
     reason: str
     at: str
 
-    def as_json(self) -> EstopHeld:
+    def as_json(self) -> EstopCause:
         """Return it as JSON."""
         return {"name": self.name, "reason": self.reason, "at": self.at}
 
@@ -87,7 +87,7 @@ def latched_sentence(entries: Sequence[Latched]) -> str:
 
 CLOSING = "the service is closing"
 
-MEANINGS: Mapping[Word, str] = {
+MEANINGS: Mapping[ServiceState, str] = {
     "closing": "the daemon ends; it has sent a stop to the head",
     "stopping": "a stop was requested; the head has not confirmed it, or the operation has not ended",
     "stopped": "an emergency stop is latched: nothing moves until a reset, not even after a restart",
@@ -130,9 +130,9 @@ class Standing:
     closing: bool = False
 
     @property
-    def state(self) -> Word:
+    def state(self) -> ServiceState:
         """The first of `MEANINGS` that is true."""
-        true: Mapping[Word, object] = {
+        true: Mapping[ServiceState, object] = {
             "closing": self.closing,
             "stopping": self.stopping,
             "stopped": self.latched,
@@ -171,11 +171,11 @@ class Standing:
             case _:
                 return ""
 
-    def as_json(self, now_s: float) -> StateTold:
+    def as_json(self, now_s: float) -> StateAnswer:
         """Return it as JSON at a moment, as events have it."""
         return {**self.summary(now_s), "track": self.track, "moving": bool(self.head_moves)}
 
-    def summary(self, now_s: float) -> StandingTold:
+    def summary(self, now_s: float) -> StateFacts:
         """Return it as JSON at a moment, without the track and whether the head moves."""
         return {
             "state": self.state,

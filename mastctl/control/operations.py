@@ -21,7 +21,7 @@ from typing import Any, Protocol
 from calib.errors import CalibError
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import DriverError
-from mastctl.answers import OperationListed, OperationState, OperationTold
+from mastctl.answers import OperationAnswer, OperationListed, OperationState
 from mastctl.as_json import as_json
 from mastctl.control.machine import CLOSING, Need, Residual, StateMachine
 from mastctl.errors import MastctlError, NotKnown, NotNow, Stopped, Unable, error_body
@@ -75,7 +75,7 @@ class Operation:
             record["ended_because"] = result["ended_because"]
         return record
 
-    def as_json(self) -> OperationTold:
+    def as_json(self) -> OperationAnswer:
         """Return the record as JSON with its steps."""
         return {**self.listed(), "steps": as_json(self.steps)}
 

@@ -21,7 +21,7 @@ from calib.geometry.rigid import FloatArray, rot_x, rot_y
 from drivers.clock import Clock
 from drivers.errors import BadOptions
 from drivers.interfaces import AxisMotion, PanTilt, Reading
-from mastctl.answers import SunTold
+from mastctl.answers import SunAnswer
 from mastctl.control.machine import StandingFault
 from mastctl.devices.keep_out import Box, KeepOuts, Pair, Span
 from mastctl.errors import BadRequest
@@ -397,7 +397,7 @@ class KeepOutJudge:
         passes = (box for box in keep_outs.holding(start) if box.name not in inside)
         return next((box.name for box in (*ends_in, *passes)), None)
 
-    def sun_as_json(self) -> SunTold:
+    def sun_as_json(self) -> SunAnswer:
         """Return the sun as ``GET /limits/sun`` has it."""
         sun, now_s = self._sun, self._clock.now_s()
         if sun is None:

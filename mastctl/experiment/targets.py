@@ -22,7 +22,7 @@ from calib.geometry.stereo import triangulate
 from calib.matching.partner import find_partner
 from calib.matching.warp import PosedImage, grey
 from drivers.interfaces import Image
-from mastctl.answers import OperationTold
+from mastctl.answers import OperationAnswer
 from mastctl.client import Client, ClientError, Snapshot
 
 BORDER_PX = 64  # nearer the edge than this a person would turn the head first
@@ -155,7 +155,7 @@ class TargetViews:
         )
 
 
-def pointed(client: Client, **request: Any) -> OperationTold:
+def pointed(client: Client, **request: Any) -> OperationAnswer:
     """Have the daemon point as `Client.point` says; return the ended operation's record.
 
     Raises ClientError if it refuses; ``timeout``, if it has not ended in time: it is stopped then, so that

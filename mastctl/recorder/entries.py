@@ -22,7 +22,7 @@ from calib.files.twin import TwinError, nearest_opencv, twin_error
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import Rigid, quaternion_of
-from mastctl.answers import HeadTold
+from mastctl.answers import HeadAnswer
 from mastctl.as_json import as_json
 from mastctl.devices.frames import StampedFrame
 from mastctl.frame_facts import FrameFacts
@@ -63,7 +63,7 @@ class Entries:
     def __init__(self, mast: AttachedMast) -> None:
         self.mast = mast
         self._newest: dict[tuple[str, str], Entry] = {}
-        self._joints: HeadTold | None = None
+        self._joints: HeadAnswer | None = None
         self._joints_written_s = float("-inf")
         self._written_dropped = 0
         self._frames: dict[str, str] = {}
@@ -126,14 +126,14 @@ class Entries:
             record = {"dropped": dict(dropped), "reason": "the disk was slower than the data"}
             file.add_json("/recorder", "recorder", record, time_s)
 
-    def _rests(self, before: HeadTold, now: HeadTold) -> bool:
+    def _rests(self, before: HeadAnswer, now: HeadAnswer) -> bool:
         """Whether the head has not moved since a reading that needs no repetition yet."""
         still = not (now["moving"] or before["moving"])
         still = still and abs(before["pan_rad"] - now["pan_rad"]) < SAME_RAD
         still = still and abs(before["tilt_rad"] - now["tilt_rad"]) < SAME_RAD
         return still and now["measured_s"] - self._joints_written_s < REST_S
 
-    def _write_joints(self, file: RecordFile, reading: HeadTold) -> None:
+    def _write_joints(self, file: RecordFile, reading: HeadAnswer) -> None:
         time_s = self._joints_written_s = reading["measured_s"]
         file.add_json("/joints", "joints", reading, time_s)
         true_rad = reading["true_pan_rad"], reading["true_tilt_rad"]

@@ -25,17 +25,17 @@ from typing_extensions import TypedDict
 
 from calib.files.records import DIALECT
 from mastctl.answers import (
-    CommandTold,
+    CommandAnswer,
     Count,
-    FaultTold,
-    HeadTold,
+    FaultAnswer,
+    HeadAnswer,
     Json,
-    LeaseTold,
-    MastTold,
-    OperationTold,
+    LeaseAnswer,
+    MastAnswer,
+    OperationAnswer,
     Pointing,
-    StateTold,
-    TrackTold,
+    StateAnswer,
+    TrackAnswer,
 )
 from mastctl.frame_facts import FrameFacts
 
@@ -75,7 +75,7 @@ class FaultRecord(TypedDict):
     """All that is wrong with one device."""
 
     device: str
-    faults: list[FaultTold]
+    faults: list[FaultAnswer]
 
 
 class DroppedRecord(TypedDict):
@@ -87,18 +87,18 @@ class DroppedRecord(TypedDict):
 
 RECORDS: Mapping[str, Any] = {
     "cahvor": RecordedCamera,
-    "command": CommandTold,
+    "command": CommandAnswer,
     "fault": FaultRecord,
     "frame": FrameFacts,
-    "joints": HeadTold,
-    "lease": LeaseTold,
-    "mast": MastTold,
-    "operation": OperationTold,
+    "joints": HeadAnswer,
+    "lease": LeaseAnswer,
+    "mast": MastAnswer,
+    "operation": OperationAnswer,
     "recorder": DroppedRecord,
     "residual": ResidualRecord,
-    "state": StateTold,
+    "state": StateAnswer,
     "target": RecordedTarget,
-    "track": TrackTold,
+    "track": TrackAnswer,
 }
 """The type of each kind of JSON message; any object where there is none."""
 

@@ -26,7 +26,7 @@ from mastctl.errors import MastctlError, error_body
 from mastctl.safety.state_folder import DAEMON_FILE, DAEMON_SCHEMA, folders_of
 
 if TYPE_CHECKING:
-    from mastctl.answers import EstopTold, StopTold
+    from mastctl.answers import EstopAnswer, StopAnswer
 
 log = logging.getLogger(__name__)
 
@@ -42,8 +42,8 @@ ANSWER_S = 5.0
 class StopHandlers(Protocol):
     """What the socket carries out."""
 
-    def stop_answer(self) -> StopTold: ...
-    def estop(self, reason: str | None, name: str | None) -> EstopTold: ...
+    def stop_answer(self) -> StopAnswer: ...
+    def estop(self, reason: str | None, name: str | None) -> EstopAnswer: ...
 
 
 class StopSocket(socketserver.ThreadingUnixStreamServer):
@@ -136,7 +136,7 @@ class _Connection(socketserver.StreamRequestHandler):
         text = line.decode("utf-8", "replace").strip()
         verb, _, rest = text.partition(" ")
         try:
-            answer: StopTold | EstopTold
+            answer: StopAnswer | EstopAnswer
             if verb == "stop" and not rest:
                 answer = stops.stop_answer()
             elif verb == "estop":

@@ -18,7 +18,7 @@ from calib.geometry.covariance import stored_covariance
 from calib.geometry.mode import SensorMode
 from calib.geometry.rig import Rig
 from drivers.errors import BadFrame
-from mastctl.answers import ConfigChange, MastTold
+from mastctl.answers import ConfigChange, MastAnswer
 from mastctl.config import Config, check_cameras, parse_config
 from mastctl.control.machine import StateMachine
 from mastctl.control.operations import OperationRunner
@@ -58,7 +58,7 @@ class MastInUse:
     data: bytes
     path: Path
 
-    def as_json(self) -> MastTold:
+    def as_json(self) -> MastAnswer:
         """Return its file, name and digest as JSON."""
         return {"file": self.path.name, "name": self.stored.rig.name, "digest": self.stored.digest}
 

@@ -26,14 +26,14 @@ from drivers.errors import BadOptions
 from drivers.hardware import Hardware, clock_for, head_name
 from drivers.simulation_clock import SimulationClock
 from mastctl.answers import (
-    CalibrationTold,
-    CameraTold,
+    CalibrationAnswer,
+    CameraAnswer,
     KeptTarget,
     MeasuredJoints,
     PanoramaDrawn,
     ReloadResult,
     Status,
-    TrackTold,
+    TrackAnswer,
 )
 from mastctl.as_json import as_json
 from mastctl.bench.operation import BenchOperation
@@ -302,13 +302,13 @@ class Service:
             return {"control": self.leases.as_json()}
         return published_value(topic, value, self.clock.now_s())
 
-    def mast_verdict(self) -> CalibrationTold:
+    def mast_verdict(self) -> CalibrationAnswer:
         """Return whether the mast file still holds, by all kinds of evidence."""
         looks, handoffs = self.sentinel.summary(), self.handoffs.summary()
         slip = self.panoramas.slip(self.stored.digest)
         return mast_verdict(self.health.verdict, looks, handoffs, slip)
 
-    def track_answer(self, status: TrackStatus | None = None) -> TrackTold:
+    def track_answer(self, status: TrackStatus | None = None) -> TrackAnswer:
         """Return the track, as it is or was, and the self-check of now, as ``GET /track`` has them."""
         track = (status or self.tracker.status).as_json(self.clock.now_s())
         return {**track, "self_check": self.handoffs.summary()}
@@ -540,7 +540,7 @@ class Service:
         self.recorder.add_handoff(line_of(handoff))
 
 
-def camera_answer(frame: StampedFrame | None, now_s: float) -> CameraTold:
+def camera_answer(frame: StampedFrame | None, now_s: float) -> CameraAnswer:
     """Return the facts of a camera's newest frame."""
     if frame is None:
         return {"frame_id": None, "sequence": None, "exposure_s": None, "age_s": None}

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError
-from mastctl.answers import EstopTold, ResetTold, StopTold
+from mastctl.answers import EstopAnswer, ResetAnswer, StopAnswer
 from mastctl.control.entry import ESTOP, STOP, CommandEntry, CommandRequest
 from mastctl.control.lease import Caller
 from mastctl.control.machine import Latched, StandingFault, StateMachine, latched_sentence
@@ -125,7 +125,7 @@ class Stopping:
         """
         return self._operations.stop(reason, lambda: self._tracker.stop(reason))
 
-    def stop_answer(self) -> StopTold:
+    def stop_answer(self) -> StopAnswer:
         """Stop as `stop`; return the answer of ``POST /stop``."""
         return {"stopped": True, "operation": self.stop()}
 
@@ -138,7 +138,7 @@ class Stopping:
         if running is not None and self._operations.running == running:
             self._operations.stop()
 
-    def estop(self, reason: str | None = None, name: str | None = None) -> EstopTold:
+    def estop(self, reason: str | None = None, name: str | None = None) -> EstopAnswer:
         """Stop the mast, and let nothing move it before `reset`, across restarts too.
 
         The head first; then what runs and the track end; then the disk is waited for. A reason may follow
@@ -162,7 +162,7 @@ class Stopping:
         if unconfirmed is not None:
             message = f"the emergency stop is latched, but the head did not confirm it: {unconfirmed}"
             raise Unable("stop_unconfirmed", f"{message}; {why}" if why else message)
-        answer: EstopTold = {
+        answer: EstopAnswer = {
             "stopped": True,
             "latched": True,
             "kept": kept,
@@ -194,7 +194,7 @@ class Stopping:
         self._machine.estop_requested(lambda: self._latch.entries)
         self._block_moves()
 
-    def reset(self, reason: str, name: str) -> ResetTold:
+    def reset(self, reason: str, name: str) -> ResetAnswer:
         """Release the emergency stop; nothing moves before a command comes.
 
         Returns the answer of ``POST /reset``: the first cause that is ``released``, and whether another came
@@ -246,11 +246,11 @@ class SocketStops:
         self._stops = stops
         self._entry = entry
 
-    def stop_answer(self) -> StopTold:
+    def stop_answer(self) -> StopAnswer:
         """Stop the mast; return the answer."""
         return self._entry.first(STOP, CommandRequest(Caller(role="view", via=VIA)), self._stops.stop_answer)
 
-    def estop(self, reason: str | None, name: str | None) -> EstopTold:
+    def estop(self, reason: str | None, name: str | None) -> EstopAnswer:
         """Latch and stop; return the answer."""
         sent = CommandRequest(Caller(role="view", via=VIA), request={"reason": reason, "name": name})
         return self._entry.first(ESTOP, sent, lambda: self._stops.estop(reason, name))

@@ -31,7 +31,7 @@ from calib.geometry.handoff import Joints
 from calib.matching.handoff import HandoffBias, Landed, MatchedHandoff, RefinedVerdict, handoff_bias
 from drivers.clock import Clock
 from drivers.recordings.mcap_file import BadRecording, is_mcap, read_messages
-from mastctl.answers import OffsetTold, SelfCheck
+from mastctl.answers import OffsetAnswer, SelfCheck
 from mastctl.control.machine import StandingFault
 from mastctl.watch.journal import Journal, JournalThread
 
@@ -137,7 +137,7 @@ def line_of(handoff: MatchedHandoff) -> dict[str, Any]:
     return dict(plain(document))
 
 
-def bias_record(bias: HandoffBias) -> OffsetTold:
+def bias_record(bias: HandoffBias) -> OffsetAnswer:
     """Return a camera's mean offset as JSON."""
     return {
         "source": bias.source,

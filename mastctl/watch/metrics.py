@@ -21,7 +21,7 @@ from prometheus_client.core import (
 )
 from prometheus_client.process_collector import ProcessCollector
 
-from mastctl.answers import Status, Word
+from mastctl.answers import ServiceState, Status
 from mastctl.control.operations import Operation
 from mastctl.control.publisher import Published, Publisher
 
@@ -145,7 +145,7 @@ class Metrics:
         about |= {"mast_file": mast["file"], "mast_digest": mast["digest"]}
         yield InfoMetricFamily("mastctl", "The program and what it drives.", about)
         states = StateSetMetricFamily("mastctl_state", "The state of the daemon.")
-        states.add_metric([], {state: state == status["state"] for state in get_args(Word)})
+        states.add_metric([], {state: state == status["state"] for state in get_args(ServiceState)})
         yield states
         yield _gauge("uptime_seconds", "Since the daemon started.", {(): status["uptime_s"]})
         if joints is not None:

@@ -27,7 +27,7 @@ from calib.files.mast_file import StoredRig
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
-from mastctl.answers import CalibrationTold, CountedPointing, ResidualVerdict, SelfCheck, SentinelTold
+from mastctl.answers import CalibrationAnswer, CountedPointing, ResidualVerdict, SelfCheck, SentinelAnswer
 from mastctl.control.operations import Operation
 from mastctl.watch.evidence import (
     Evidence,
@@ -215,8 +215,8 @@ def _what_drifts(evidence: Evidence, since: str) -> str:
 
 
 def mast_verdict(
-    residuals: ResidualVerdict, looks: SentinelTold | None, handoffs: SelfCheck, panorama: str
-) -> CalibrationTold:
+    residuals: ResidualVerdict, looks: SentinelAnswer | None, handoffs: SelfCheck, panorama: str
+) -> CalibrationAnswer:
     """Return the verdict as ``GET /status`` has it under ``calibration``.
 
     ``panorama``: what the seams of the last one say, empty for nothing. ``drifts`` if any of these says so,

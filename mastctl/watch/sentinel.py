@@ -24,7 +24,7 @@ from calib.errors import BadFile
 from calib.files import read_bytes, replace_bytes
 from calib.files.records import Moment, Record, Text, problem, read_record
 from calib.matching.warp import Grey, grey
-from mastctl.answers import SentinelTold
+from mastctl.answers import SentinelAnswer
 from mastctl.as_json import as_json
 from mastctl.watch.journal import Journal, JournalThread
 
@@ -225,7 +225,7 @@ def now_utc() -> str:
 
 def standing(
     reference: Reference, looks: Sequence[Mapping[str, Any]], now: datetime | None = None
-) -> SentinelTold:
+) -> SentinelAnswer:
     """Return what the looks at a reference say together; ``now`` for how long ago, the present by default.
 
     ``bad`` for a change that two looks see, ``unsure`` for no look, one, or silent ones.
@@ -264,7 +264,7 @@ def _judged(
     return "bad", f"{last['sentence']}, since {_for_long(first, now)}{old}{blind}", first
 
 
-def findings(folder: Path, mast_digest: str) -> SentinelTold:
+def findings(folder: Path, mast_digest: str) -> SentinelAnswer:
     """Return what a folder says, as ``GET /sentinel`` has it; ``mast_digest``: of the mast file in use."""
     damaged = ""
     try:
@@ -319,11 +319,11 @@ class SentinelFindings:
     def __init__(self, folder: Path, mast_digest: Callable[[], str], thread: JournalThread) -> None:
         self._folder = folder
         self._mast_digest = mast_digest
-        self._found: SentinelTold | None = None
+        self._found: SentinelAnswer | None = None
         self._read: object = None
         thread.poll(self._poll)
 
-    def summary(self) -> SentinelTold | None:
+    def summary(self) -> SentinelAnswer | None:
         """Return the answer of ``GET /sentinel``, None before the folder was read for the first time."""
         found = self._found
         if found is None or found["last_look"] is None:

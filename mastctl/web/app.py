@@ -21,7 +21,7 @@ from pydantic import Field, TypeAdapter
 from starlette.types import ASGIApp, Receive, Scope, Send
 from typing_extensions import get_type_hints, is_typeddict
 
-from mastctl.answers import ErrorBody, Event, TrackTold
+from mastctl.answers import ErrorBody, Event, TrackAnswer
 from mastctl.http.guard import Guard
 from mastctl.http.refusals import JsonAnswer, add_errors
 from mastctl.web.commands import REFERENCE, Here, Parts
@@ -130,7 +130,7 @@ def _made(app: FastAPI) -> bytes:
                 route.response_description = (kind.__doc__ or kind.__name__).strip().splitlines()[0]
     document = app.openapi()
     one = Field(discriminator="topic", title="Event", description="One event of ``/events``.")
-    streamed: dict[str, Any] = {"Event": Annotated[Event, one], "TrackTold": TrackTold}
+    streamed: dict[str, Any] = {"Event": Annotated[Event, one], "TrackAnswer": TrackAnswer}
     for name, streams in streamed.items():
         schema = TypeAdapter(streams).json_schema(mode="serialization", ref_template=REFERENCE)
         document["components"]["schemas"] |= schema.pop("$defs", {}) | {name: schema}

@@ -55,7 +55,7 @@ def add_events(app: FastAPI) -> None:
         f"{PREFIX}/track/stream",
         summary="The track as server-sent events: now, and at each change",
         response_class=StreamingResponse,
-        responses=stream_of("TrackTold"),
+        responses=stream_of("TrackAnswer"),
     )
     async def track(here: Here) -> StreamingResponse:
         return _Lines(here, ("track",), None, _track)

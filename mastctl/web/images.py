@@ -19,7 +19,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from calib.geometry.mode import flip_name
 from drivers.interfaces import SETTINGS
-from mastctl.answers import CameraSettingsTold
+from mastctl.answers import CameraSettingsAnswer
 from mastctl.as_json import as_json
 from mastctl.control.entry import CAMERA_SETTINGS
 from mastctl.frame_facts import described_headers, headers_of
@@ -75,17 +75,17 @@ def add_cameras(app: FastAPI) -> None:
     """The settings of a camera."""
 
     @app.get(f"{PREFIX}/cameras/{{camera}}/settings", summary="The settings of a camera, with their bounds")
-    async def settings(camera: str, here: Here) -> CameraSettingsTold:
+    async def settings(camera: str, here: Here) -> CameraSettingsAnswer:
         here.service.check_camera(camera)
         return await here.waiting.run(lambda: _settings(here, camera, []))
 
     @command(app, "PATCH /cameras/{camera}/settings", CAMERA_SETTINGS)
-    def change(camera: str, body: CameraSettingsBody, here: Here) -> CameraSettingsTold:
+    def change(camera: str, body: CameraSettingsBody, here: Here) -> CameraSettingsAnswer:
         """Change some of a camera's settings, each with its automatic turned off."""
         return _settings(here, camera, here.service.devices.settings.change(camera, body.wanted))
 
 
-def _settings(here: Parts, camera: str, notes: list[str]) -> CameraSettingsTold:
+def _settings(here: Parts, camera: str, notes: list[str]) -> CameraSettingsAnswer:
     devices = here.service.devices
     found, fixed = devices.settings.of(camera)
     mode = devices.sensor_modes.get(camera)

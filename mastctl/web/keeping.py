@@ -60,9 +60,9 @@ def add_masts(app: FastAPI) -> None:
 
     @command(app, "POST /mast", entry.MAST)
     def load_mast(body: MastBody, here: Here) -> answers.MastChange:
-        """Use another mast file, or the former one, from now on."""
+        """Use another mast file from now on."""
         masts = here.service.masts
-        return _mast_change(masts, masts.back() if body.file is None else masts.load(body.file))
+        return _mast_change(masts, masts.load(body.file))
 
     @command(app, "POST /mast/back", entry.MAST_BACK)
     def back(here: Here) -> answers.MastChange:

@@ -230,16 +230,9 @@ class TimeBody(StrictBody):
 
 
 class MastBody(StrictBody):
-    """``POST /mast``: the name of a file beside the configured mast file, or ``previous``: true."""
+    """``POST /mast``: the name of a file beside the configured mast file."""
 
-    file: Name | None = None
-    previous: bool = False
-
-    @model_validator(mode="after")
-    def _one(self) -> MastBody:
-        if (self.file is not None) == self.previous:
-            raise ValueError("file, or previous: true, is expected, and not both")
-        return self
+    file: Name
 
 
 class PlaceBody(StrictBody):

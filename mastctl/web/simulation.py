@@ -104,7 +104,7 @@ def add_simulation(app: FastAPI) -> None:
         return await here.waiting.run(lambda: _truth(here.service, query))
 
     @app.get(f"{PREFIX}/simulation/words", summary="The fault words of each device, with their parameters")
-    async def words(here: Here) -> answers.FaultWordList:
+    async def words(here: Here) -> answers.FaultKinds:
         return await here.waiting.run(lambda: {"devices": _words(_panel(here.service))})
 
     @app.get(f"{PREFIX}/simulation/faults", summary="The faults that are switched on")
@@ -186,14 +186,14 @@ def _truth_of(site_from_rover: Rigid, point_m: FloatArray | None, pixel_px: Any)
     }
 
 
-def _words(panel: FaultPanel) -> dict[str, dict[str, answers.FaultWord]]:
+def _words(panel: FaultPanel) -> dict[str, dict[str, answers.FaultKind]]:
     """The fault words of each device; what has no end is null."""
 
     def parameter(name: str, usual: float) -> answers.FaultParameter:
         least, most = BOUNDS[name]
         return {"default": as_json(usual), "least": least, "most": as_json(most)}
 
-    def word(one: Word) -> answers.FaultWord:
+    def word(one: Word) -> answers.FaultKind:
         parameters = {**one.parameters, **WHEN}
         return {
             "effect": one.does,

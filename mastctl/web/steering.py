@@ -87,7 +87,7 @@ def add_pointing(app: FastAPI) -> None:
         return {"operations": [one.listed() for one in here.service.operations.all()]}
 
     @app.get(f"{PREFIX}/operations/{{operation_id}}", summary="One operation's record")
-    async def operation(operation_id: str, here: Here) -> answers.OperationTold:
+    async def operation(operation_id: str, here: Here) -> answers.OperationAnswer:
         return here.service.operations.get(operation_id).as_json()
 
     @app.post(
@@ -96,7 +96,7 @@ def add_pointing(app: FastAPI) -> None:
     )
     async def stop_one(
         operation_id: str, request: Request, here: Here, requested: Requested
-    ) -> answers.OperationTold:
+    ) -> answers.OperationAnswer:
         def act() -> dict[str, Any]:  # no id: it begins nothing
             here.service.operations.stop_one(operation_id)
             return {}
@@ -105,7 +105,7 @@ def add_pointing(app: FastAPI) -> None:
         return here.service.operations.get(operation_id).as_json()
 
     @app.post(f"{PREFIX}/stop", summary="Stop the mast and the running operation, at once")
-    async def stop(request: Request, here: Here) -> answers.StopTold:
+    async def stop(request: Request, here: Here) -> answers.StopAnswer:
         return await stop_first(here, entry.STOP, request, here.service.stopping.stop_answer)
 
 
@@ -117,7 +117,7 @@ def add_estop(app: FastAPI) -> None:
         summary="Stop the mast and let nothing move it until it is reset, across restarts too",
         openapi_extra={"requestBody": {"content": {"application/json": {"schema": ANY_BODY}}}},
     )
-    async def estop(request: Request, here: Here) -> answers.EstopTold:
+    async def estop(request: Request, here: Here) -> answers.EstopAnswer:
         stopping = here.service.stopping
         reading = asyncio.ensure_future(_reason_and_name(request))
         await asyncio.wait([reading], timeout=0)  # one turn of the loop: what came with the request is read
@@ -140,7 +140,7 @@ def add_estop(app: FastAPI) -> None:
         return answer if cause is None else {**answer, "reason": cause.reason, "name": cause.name}
 
     @command(app, "POST /reset", entry.RESET)
-    def reset(body: ResetBody, here: Here) -> answers.ResetTold:
+    def reset(body: ResetBody, here: Here) -> answers.ResetAnswer:
         """Release an emergency stop; nothing moves before the next command."""
         return here.service.stopping.reset(body.reason, body.name)
 
@@ -178,7 +178,7 @@ def add_tracking(app: FastAPI) -> None:
         return {"operation": operation, "track": here.service.track_answer()}
 
     @app.get(f"{PREFIX}/track", summary="The track at this moment")
-    async def track(here: Here) -> answers.TrackTold:
+    async def track(here: Here) -> answers.TrackAnswer:
         return here.service.track_answer()
 
     @command(app, "POST /track", entry.TRACK, status_code=202, usual_s=one_look_s)
@@ -193,7 +193,7 @@ def add_tracking(app: FastAPI) -> None:
         return {"id": here.service.steering.look().id}
 
     @app.post(f"{PREFIX}/track/stop", summary="End the track; the head stops if it moves for it")
-    async def stop(request: Request, here: Here, requested: Requested) -> answers.TrackTold:
+    async def stop(request: Request, here: Here, requested: Requested) -> answers.TrackAnswer:
         def act() -> dict[str, Any]:  # no id: it begins nothing
             here.service.stopping.stop_track()
             return {}
@@ -211,11 +211,11 @@ def add_limits(app: FastAPI) -> None:
         return here.service.jogs.beat(body)
 
     @app.get(f"{PREFIX}/limits/sun", summary="The direction that no head camera looks into")
-    async def sun(here: Here) -> answers.SunTold:
+    async def sun(here: Here) -> answers.SunAnswer:
         return here.service.devices.judge.sun_as_json()
 
     @command(app, "POST /limits/sun", entry.SUN)
-    def tell(body: SunBody, here: Here, requested: Requested) -> answers.SunTold:
+    def tell(body: SunBody, here: Here, requested: Requested) -> answers.SunAnswer:
         """Say where the sun stands; the head keeps off it."""
         judge = here.service.devices.judge
         judge.use_sun(body.sun(requested.came_s))
@@ -223,7 +223,7 @@ def add_limits(app: FastAPI) -> None:
         return judge.sun_as_json()
 
     @command(app, "DELETE /limits/sun", entry.SUN_FORGET)
-    def forget(here: Here) -> answers.SunTold:
+    def forget(here: Here) -> answers.SunAnswer:
         """Keep the head off no sun any more."""
         judge = here.service.devices.judge
         judge.use_sun(None)
@@ -241,7 +241,7 @@ def add_lease(app: FastAPI) -> None:
     """Who steers: acquired, renewed, released, taken over."""
 
     @app.get(f"{PREFIX}/lease", summary="Who steers")
-    async def control(here: Here) -> answers.LeaseTold:
+    async def control(here: Here) -> answers.LeaseAnswer:
         return {"control": here.service.leases.as_json()}
 
     @command(app, "POST /lease", entry.LEASE)
@@ -265,7 +265,7 @@ def add_lease(app: FastAPI) -> None:
         return _granted(leases, leases.renew(_lease_of(requested), None if body is None else body.for_s))
 
     @command(app, "DELETE /lease", entry.LEASE_RELEASE, recorded=lambda requested, **_: _which(requested))
-    def release(here: Here, requested: Requested) -> answers.LeaseTold:
+    def release(here: Here, requested: Requested) -> answers.LeaseAnswer:
         """Release the lease."""
         leases = here.service.leases
         leases.release(_lease_of(requested))

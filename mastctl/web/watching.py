@@ -31,7 +31,7 @@ def add_watching(app: FastAPI) -> None:
         return Response(text, media_type=CONTENT_TYPE)
 
     @app.get(f"{PREFIX}/health/live", summary="Whether requests are answered: they are")
-    async def live(request: Request, here: Here) -> answers.LiveTold:
+    async def live(request: Request, here: Here) -> answers.LiveAnswer:
         access = here.entrance.access
         if access is None or not from_this_machine(request.scope, request.headers):
             return {"live": True}
@@ -41,7 +41,7 @@ def add_watching(app: FastAPI) -> None:
         f"{PREFIX}/health/ready",
         summary="Whether commands are carried out: 200 if they are, else 503 and why not",
     )
-    async def ready(request: Request, here: Here) -> answers.ReadyTold:
+    async def ready(request: Request, here: Here) -> answers.ReadyAnswer:
         now = here.service.machine.standing
         reason = "" if caller_of(request).stranger else now.reason  # it may name a person
         if now.state not in WELL:
@@ -64,7 +64,7 @@ def add_watching(app: FastAPI) -> None:
         }
 
     @app.get(f"{PREFIX}/sentinel", summary="The findings of the drift sentinel, and the age of its last look")
-    async def sentinel(here: Here) -> answers.SentinelTold:
+    async def sentinel(here: Here) -> answers.SentinelAnswer:
         service = here.service
         folder = service.folder.path / SENTINEL_FOLDER
         return await here.waiting.run(lambda: findings(folder, service.stored.digest))

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from drivers.clock import ManualClock
-from mastctl.answers import Word
+from mastctl.answers import ServiceState
 from mastctl.control.machine import Latched, Residual, Standing, StandingFault, StateMachine
 from mastctl.control.publisher import Publisher, Topic
 from mastctl.errors import MastctlError, NotNow, Unable
@@ -55,7 +55,7 @@ def asked_reset(machine: StateMachine, name: str) -> None:
 
 
 # The way into each state, by what is told on it alone.
-INTO: dict[Word, Callable[[StateMachine], Any]] = {
+INTO: dict[ServiceState, Callable[[StateMachine], Any]] = {
     "starting": lambda machine: None,
     "ready": lambda machine: None,
     "moving": lambda machine: machine.operation_began("1", {}),
@@ -99,7 +99,7 @@ ROWS = [line.split() for line in MUST.strip().splitlines()[1:]]
 PAIRS = [(row[0], event, must) for row in ROWS for event, must in zip(TELL, row[1:], strict=True)]
 
 
-def machine_in(word: Word) -> tuple[StateMachine, Heard, ManualClock]:
+def machine_in(word: ServiceState) -> tuple[StateMachine, Heard, ManualClock]:
     clock, heard = ManualClock(10.0), Heard()
     machine = StateMachine(clock, heard)
     if word != "starting":
@@ -110,7 +110,7 @@ def machine_in(word: Word) -> tuple[StateMachine, Heard, ManualClock]:
 
 
 @pytest.mark.parametrize(("word", "event", "must"), PAIRS)
-def test_every_event_in_every_state_does_what_the_states_mean(word: Word, event: str, must: str) -> None:
+def test_every_event_in_every_state_does_what_states_mean(word: ServiceState, event: str, must: str) -> None:
     machine, heard, clock = machine_in(word)
     before, published = machine.standing, len(heard.standings)
     clock.advance(5.0)
@@ -262,7 +262,7 @@ def test_a_latch_from_before_the_start_blocks_at_once() -> None:
         ("closing", ("closing", "closing", "closing", "closing")),
     ],
 )
-def test_what_each_state_refuses(word: Word, codes: Sequence[str | None]) -> None:
+def test_what_each_state_refuses(word: ServiceState, codes: Sequence[str | None]) -> None:
     machine, _, _ = machine_in(word)
     for need, code in zip(("motion", "track", "rest", "latch"), codes, strict=True):
         refusal = machine.refusal(need)  # type: ignore[arg-type]

@@ -71,14 +71,13 @@ def test_another_mast_file_is_used_from_now_on(web: httpx.Client, folder: Path) 
     assert shot.headers["Mastctl-Mast-Digest"] == wanted.digest
 
 
-@pytest.mark.parametrize("way", ["back", "previous"])
 def test_the_former_comes_back_as_it_was_though_its_file_changed(
-    web: httpx.Client, daemon: RunningDaemon, folder: Path, way: str
+    web: httpx.Client, daemon: RunningDaemon, folder: Path
 ) -> None:
     before, content = in_use(web), web.get("/mast").content
     assert web.post("/mast", json={"file": "better.yaml"}).status_code == 200
     daemon.service.config.mast_file.write_text("schema: nothing\n")
-    answer = web.post("/mast/back") if way == "back" else web.post("/mast", json={"previous": True})
+    answer = web.post("/mast/back")
     assert answer.status_code == 200, answer.text
     assert in_use(web) == before
     assert web.get("/mast").content == content
