@@ -107,6 +107,7 @@ class BenchRunRecord(BenchProgress):
     name: str
     begun: str
     by: str
+    board: str
     state: BenchState
     step: BenchStep
     code: str | None
@@ -155,18 +156,3 @@ class BenchAnswer(TypedDict):
     """A bench calibration that has begun or goes on, is answered, or has ended."""
 
     run: BenchRunRecord
-
-
-class ReportSummary(TypedDict):
-    """A report that can be read."""
-
-    name: str
-    title: str
-    written: str
-
-
-class ReportList(TypedDict):
-    """The reports, the newest first, and the folder where others may be put."""
-
-    reports: list[ReportSummary]
-    folder: str

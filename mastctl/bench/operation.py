@@ -16,7 +16,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
@@ -27,7 +26,16 @@ from calib.errors import BadFile
 from calib.files import replace_bytes
 from drivers.errors import DriverError
 from mastctl.answers import BenchRunRecord, BenchRuns, BenchState
-from mastctl.bench.runs import HOLDER, BenchJob, RunFiles, Runs, board_bytes, known_boards, new_record
+from mastctl.bench.runs import (
+    HOLDER,
+    SHOWN,
+    BenchJob,
+    RunFiles,
+    Runs,
+    board_bytes,
+    known_boards,
+    new_record,
+)
 from mastctl.control.lease import Caller, Lease, LeaseTable, StopCame
 from mastctl.control.publisher import Publisher
 from mastctl.errors import BadRequest, MastctlError, NotNow, Unable
@@ -59,7 +67,6 @@ class _Work:
     """A run that is at work, or was."""
 
     folder: RunFiles
-    request: dict[str, Any]
     lease: Lease
     revoke_token: Callable[[], None]
     run: BenchRunRecord
@@ -105,14 +112,9 @@ class BenchOperation:
         work = self._work
         return None if work is None else work.run
 
-    @property
-    def pid(self) -> int | None:
-        """The process of the newest worker."""
-        return None if self._work is None else self._work.process.pid
-
     def answer(self) -> BenchRuns:
         """Return the answer of ``GET /bench``; reads the folders."""
-        now, runs = self.run, list(self.runs.summaries())
+        now, runs = self.run, [one.summary() for one in self.runs.all()[:SHOWN]]
         for one in runs:
             if now is not None and now["step"] != "over" and one["name"] == now["name"]:
                 one["state"], one["sentence"] = "running", ""
@@ -145,8 +147,8 @@ class BenchOperation:
                 raise Unable("closing", "a bench calibration begins only while the daemon serves")
             masts = self._masts_folder()
             _check_space(masts, self.runs.folder.parent)
-            folder, request = self._request(by, wanted)
-            return self._begin(folder, request, masts, last_stop or self._leases.last_stop)
+            folder, run = self._requested(by, wanted)
+            return self._begin(folder, run, masts, last_stop or self._leases.last_stop)
 
     def stands(self) -> BenchRunRecord:
         """Pass on that the board stands where it was requested.
@@ -202,54 +204,47 @@ class BenchOperation:
             raise NotNow("bench_idle", "no bench calibration is at work")
         return work
 
-    def _request(self, by: str, wanted: Mapping[str, Any]) -> tuple[RunFiles, dict[str, Any]]:
-        """Return the run's folder with all that it needs, and what is requested of it."""
-        stated = {key: wanted.get(key) for key in ("wanted_px", "pictures", "by_hand")}
-        request: dict[str, Any] = {"wanted_px": 0.2, "pictures": 60, "by_hand": False}
+    def _requested(self, by: str, wanted: Mapping[str, Any]) -> tuple[RunFiles, BenchRunRecord]:
+        """Return the run's folder with all that it needs, and the run as it begins."""
+        keys = {"wanted_px": "wanted_px", "pictures": "most", "by_hand": "by_hand"}
+        stated = {keys[key]: wanted[key] for key in keys if wanted.get(key) is not None}
+        data = None
         if wanted.get("resume") is not None:
             folder = self.runs.named(wanted["resume"])
             try:
                 before = folder.read()
-                before |= {"begun": str(before["begun"]), "mast_file": str(before["mast_file"])}
             except BadFile as error:
                 raise BadRequest("bad_run", str(error)) from None
-            except KeyError as error:
-                missing = f"{error} is missing in {folder.path}; begin another run"
-                raise BadRequest("bad_run", missing) from None
-            if (before.pop("end", None) or {}).get("state") == "done":
+            if before["state"] == "done":
                 raise NotNow("bench_done", f"run {folder.name} has its verdict; begin another")
+            kept = {key: before[key] for key in ("begun", *keys.values())}  # type: ignore[literal-required]
+            stated, described = kept | stated, before["board"]
         else:
             data, board = board_bytes(wanted.get("board"), wanted.get("board_file"))
             folder = self.runs.new()
             width_mm, height_mm = (1000 * size_m for size_m in board.size_m)
-            before = {
-                "begun": datetime.now(UTC).isoformat(timespec="seconds"),
-                "mast_file": f"bench-{folder.name}.yaml",
-                "board": f"{wanted.get('board') or board.kind}, {width_mm:.0f} x {height_mm:.0f} mm",
-            }
-        request |= {**before, **{key: one for key, one in stated.items() if one is not None}, "by": by}
-        request["by_hand"] = request["by_hand"] or not self._simulated
+            described = f"{wanted.get('board') or board.kind}, {width_mm:.0f} x {height_mm:.0f} mm"
+        run = new_record(folder.name, by, described, self._simulated, **stated)
+        run["by_hand"] = run["by_hand"] or not self._simulated
         try:
-            if wanted.get("resume") is None:
+            if data is not None:
                 replace_bytes(folder.board, data, 0o644)
-            folder.write(request)
+            folder.write(run)
         except (BadFile, OSError) as error:
             raise Unable("unwritable", f"{folder.path} cannot be written: {error}") from None
-        return folder, request
+        return folder, run
 
     def _begin(
-        self, folder: RunFiles, request: dict[str, Any], masts: Path, last_stop: StopCame
+        self, folder: RunFiles, run: BenchRunRecord, masts: Path, last_stop: StopCame
     ) -> BenchRunRecord:
         inside = Caller(HOLDER, "operate", "inside")
-        lease = self._leases.take(inside, f"{request['by']} began it", HOLDER, LEASE_S, last_stop)
+        lease = self._leases.take(inside, f"{run['by']} began it", HOLDER, LEASE_S, last_stop)
         token, revoke_token = self._lend(HOLDER)
-        run = new_record(folder.name, request, self._simulated)
-        files = folder.board, folder.seen, masts / request["mast_file"], folder.report
-        job = BenchJob(run, self._url, lease.id, token or None, *files)
+        job = BenchJob(run, folder, masts / mast_file(run), self._url, lease.id, token or None)
         context = get_context("spawn")  # a fork would copy the daemon's threads half
         ours, its = context.Pipe()
         process = context.Process(target=self.work, args=(job, its), name=HOLDER, daemon=True)
-        work = self._work = _Work(folder, request, lease, revoke_token, run, process, ours)
+        work = self._work = _Work(folder, lease, revoke_token, run, process, ours)
         try:
             process.start()
             its.close()
@@ -258,7 +253,7 @@ class BenchOperation:
             sentence = f"the calibration program cannot be started: {error}"
             self._end(work, "interrupted", "no_process", sentence)
             raise Unable("no_process", sentence) from None
-        log.info("bench calibration %s begins, requested by %s", folder.name, request["by"])
+        log.info("bench calibration %s begins, requested by %s", folder.name, run["by"])
         self._publish(work)
         return run
 
@@ -326,12 +321,12 @@ class BenchOperation:
         sentences = [*work.run["sentences"], sentence] if run is None else run["sentences"]
         last = {
             "state": state, "step": "over", "code": code, "sentence": sentence, "sentences": sentences,
-            "mast_file": work.request["mast_file"] if state == "done" else None,
+            "mast_file": mast_file(work.run) if state == "done" else None,
             "report": work.folder.name if work.folder.page.is_file() else None,
         }  # fmt: skip
         work.run = cast(BenchRunRecord, {**(run or work.run), **last})
         try:
-            work.folder.write(work.request, work.run)
+            work.folder.write(work.run)
         except BadFile as error:
             log.error("how the bench calibration ended is not kept: %s", error)
         (log.info if state == "done" else log.warning)("bench calibration %s: %s", work.run["name"], sentence)
@@ -340,6 +335,11 @@ class BenchOperation:
     def _publish(self, work: _Work) -> None:
         with self._changing:  # so that no older state is published after a newer one
             self._publisher.publish("bench", "run", work.run)
+
+
+def mast_file(run: BenchRunRecord) -> str:
+    """Return the name of the mast file that a run makes."""
+    return f"bench-{run['name']}.yaml"
 
 
 def _check_space(masts: Path, state: Path) -> None:

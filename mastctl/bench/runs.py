@@ -1,72 +1,53 @@
-"""The folders of runs, below ``bench`` in the daemon's state folder, and the reports that a daemon shows.
+"""The folders of bench calibrations, below ``bench`` in the daemon's state folder.
 
-20261122-184501/run.json       the request (client, time, what is wanted, the mast file to make) and, under
-                               ``end``, how it ended; without it it was cut off
+20261122-184501/run.json       the run's record, as it began or as it ended
                 board.yaml     the board
                 seen/          the survey, and the run's journal
                 report/        bench.html
 
-Other reports lie in ``reports`` of the state folder. A run or report is found by its name in the list of
-those that exist; no path is ever made of a requested name.
+A run is found by its name in the list of those that exist; no path is ever made of a requested name.
 """
 
 from __future__ import annotations
 
-import html
 import re
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from pydantic import TypeAdapter, ValidationError
+
 from calib.errors import BadFile
-from calib.files import is_plain_file, read_bytes
+from calib.files import read_bytes
 from calib.targets.board_file import parse_board
 from calib.targets.boards import AnyBoard
-from mastctl.answers import BenchRunRecord, BenchSummary, ReportSummary
+from mastctl.answers import BenchRunRecord, BenchSummary
 from mastctl.errors import BadRequest, NotKnown, Unable
 from mastctl.packaged import config_folder
 from mastctl.safety.state_folder import StateFile
 
 NAME = re.compile(r"[0-9]{8}-[0-9]{6}(-[0-9]{1,3})?")
-REPORT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-SCHEMA = "mastctl/bench_run/1"
-SHOWN, REPORTS_SHOWN = 50, 100
+SCHEMA = "mastctl/bench_run/2"
+SHOWN = 50
 MOST_BOARD_BYTES, MOST_REPORT_BYTES = 100_000, 50_000_000
-_TITLE = re.compile(rb"<title>([^<]{1,300})</title>")
-
 
 HOLDER = "bench calibration"
 """The name of a worker as a client of its daemon."""
 
 
-@dataclass(frozen=True)
-class BenchJob:
-    """What a worker needs: the run as it begins, the daemon with the lease and token to steer it, files."""
-
-    run: BenchRunRecord
-    url: str
-    lease_id: str
-    token: str | None
-    board: Path
-    survey: Path
-    out: Path
-    report: Path
-
-
-def new_record(name: str, request: Mapping[str, Any], simulated: bool) -> BenchRunRecord:
-    """Return a run as it begins; ``request`` as in its folder's run.json."""
-    return {
-        "name": name, "begun": request["begun"], "by": request["by"], "state": "running", "step": "begin",
-        "code": None, "sentence": "", "simulated": simulated, "by_hand": request["by_hand"],
-        "wanted_px": request["wanted_px"], "board_m": None, "requested": None, "placements": 0, "pictures": 0,
-        "most": request["pictures"], "predicted_px": None, "target_px": None, "counts_px": None,
-        "expected_px": None, "next_rad": None, "cameras": {}, "curve": [], "sentences": [], "result": None,
-        "mast_file": None, "report": None,
+def new_record(name: str, by: str, board: str, simulated: bool, **wanted: Any) -> BenchRunRecord:
+    """Return a run as it begins; ``wanted`` replaces what is usual."""
+    usual: dict[str, Any] = {
+        "begun": datetime.now(UTC).isoformat(timespec="seconds"), "state": "running", "step": "begin",
+        "code": None, "sentence": "", "by_hand": False, "wanted_px": 0.2, "board_m": None, "requested": None,
+        "placements": 0, "pictures": 0, "most": 60, "predicted_px": None, "target_px": None,
+        "counts_px": None, "expected_px": None, "next_rad": None, "cameras": {}, "curve": [], "sentences": [],
+        "result": None, "mast_file": None, "report": None,
     }  # fmt: skip
+    return {"name": name, "by": by, "board": board, "simulated": simulated, **(usual | wanted)}  # type: ignore[typeddict-item]
 
 
 @dataclass(frozen=True)
@@ -91,44 +72,34 @@ class RunFiles:
         return self.path / "seen"
 
     @property
-    def report(self) -> Path:
-        """The report's folder."""
-        return self.path / "report"
-
-    @property
     def page(self) -> Path:
         """The report."""
-        return self.report / "bench.html"
+        return self.path / "report" / "bench.html"
 
-    def read(self) -> dict[str, Any]:
+    def read(self) -> BenchRunRecord:
         """Return run.json. Raises BadFile."""
-        document = StateFile(self.path / "run.json", SCHEMA).read()
-        if document is None:
-            raise BadFile(self.path / "run.json", "", "is missing: this is no run's folder")
-        return document
+        file = StateFile(self.path / "run.json", SCHEMA)
+        try:
+            return TypeAdapter(BenchRunRecord).validate_python(file.read())
+        except ValidationError as error:
+            first = error.errors()[0]
+            place = ".".join(map(str, first["loc"]))
+            raise BadFile(file.path, place, f"{first['msg']}: it is no run's record") from None
 
-    def write(self, request: Mapping[str, Any], ended: BenchRunRecord | None = None) -> None:
-        """Write run.json: what is requested, and how the run has ended. Raises BadFile."""
-        document = dict(request)
-        if ended is not None:
-            document["end"] = {
-                **{key: ended[key] for key in ("state", "code", "sentence")},
-                "grade": None if ended["result"] is None else ended["result"]["verdict"]["grade"],
-                "at": datetime.now(UTC).isoformat(timespec="seconds"),
-            }  # fmt: skip
-        StateFile(self.path / "run.json", SCHEMA).write(document)
+    def write(self, run: BenchRunRecord) -> None:
+        """Write run.json. Raises BadFile."""
+        StateFile(self.path / "run.json", SCHEMA).write(run)
 
     def summary(self) -> BenchSummary:
         """Return the run as the list of runs has it; of a damaged one that it is."""
-        request: Mapping[str, Any] = {}
+        run: dict[str, Any] = {"result": None, "mast_file": None, "begun": "", "by": "", "board": ""}
         try:
-            request = self.read()
-            end = request.get("end") or {
-                "state": "interrupted",
-                "sentence": "it was cut off: the daemon or its machine ended meanwhile",
-            }
+            run |= self.read()
         except BadFile as error:
-            end = {"state": "damaged", "sentence": str(error)}
+            run |= {"state": "damaged", "sentence": str(error)}
+        if run["state"] in ("running", "waiting"):
+            cut_off = "it was cut off: the daemon or its machine ended meanwhile"
+            run |= {"state": "interrupted", "sentence": cut_off}
         try:
             sizes = {one.name: one.stat().st_size for one in (self.seen / "images").iterdir()}
         except OSError:
@@ -136,24 +107,37 @@ class RunFiles:
         cameras = Counter(name.removesuffix(".png").split("-", 2)[-1] for name in sizes)
         return {
             "name": self.name,
-            "begun": str(request.get("begun", "")),
-            "by": str(request.get("by", "")),
-            "board": str(request.get("board", "")),
-            "state": end["state"],
-            "sentence": str(end["sentence"]),
+            "begun": run["begun"],
+            "by": run["by"],
+            "board": run["board"],
+            "state": run["state"],
+            "sentence": run["sentence"],
             "pictures": max(cameras.values(), default=0),
             "size_mb": sum(sizes.values()) / 1e6,
-            "grade": end.get("grade"),
-            "mast_file": request.get("mast_file") if end["state"] == "done" else None,
+            "grade": None if run["result"] is None else run["result"]["verdict"]["grade"],
+            "mast_file": run["mast_file"],
             "report": self.name if self.page.is_file() else None,
         }
 
 
+@dataclass(frozen=True)
+class BenchJob:
+    """What a worker needs: the run as it begins with its folder, the mast file to make, and the daemon with
+    the lease and the token to steer it."""
+
+    run: BenchRunRecord
+    folder: RunFiles
+    out: Path
+    url: str
+    lease_id: str
+    token: str | None
+
+
 class Runs:
-    """All runs and reports of one daemon."""
+    """All runs of one daemon."""
 
     def __init__(self, state: Path) -> None:
-        self.folder, self.reports_folder = state / "bench", state / "reports"
+        self.folder = state / "bench"
 
     def new(self) -> RunFiles:
         """Make a folder for a run that begins now. Raises Unable ``unwritable``."""
@@ -187,44 +171,22 @@ class Runs:
 
     def all(self) -> list[RunFiles]:
         """Return all, the newest first. What is no run's folder, or a link, is passed over."""
+        try:
+            found = sorted(self.folder.iterdir(), reverse=True)
+        except OSError:
+            return []
         return [
             RunFiles(one)
-            for one in reversed(_entries(self.folder))
+            for one in found
             if NAME.fullmatch(one.name) and not one.is_symlink() and (one / "run.json").is_file()
         ]
 
-    def summaries(self) -> Iterator[BenchSummary]:
-        """Yield the newest runs as the list of runs has them."""
-        return (one.summary() for one in self.all()[:SHOWN])
-
-    def reports(self) -> list[ReportSummary]:
-        """Return the reports' names, titles and when they were written (ISO 8601, UTC), the newest first."""
-        found = [one for name, path in self._reports().items() if (one := _report_summary(name, path))]
-        return sorted(found, key=lambda one: one["written"], reverse=True)[:REPORTS_SHOWN]
-
     def report(self, name: str) -> bytes:
-        """Return a report's HTML. Raises NotKnown ``report_unknown``."""
-        path = self._reports().get(name)
-        if path is None:
-            raise NotKnown("report_unknown", f"there is no report '{name[:60]}'")
+        """Return the HTML of a run's report. Raises NotKnown ``bench_unknown``, ``report_unknown``."""
         try:
-            return read_bytes(path, MOST_REPORT_BYTES)
+            return read_bytes(self.named(name).page, MOST_REPORT_BYTES)
         except BadFile as error:
-            raise NotKnown("report_unknown", f"report '{name[:60]}': {error.reason}") from None
-
-    def _reports(self) -> dict[str, Path]:
-        """Each report's name and file; what is a link to elsewhere is none."""
-        found = {run.name: run.page for run in self.all()}
-        for path in _entries(self.reports_folder):
-            inside = [] if path.is_symlink() else _entries(path)
-            for name, file in ((path.name, path), *((f"{path.name}.{one.name}", one) for one in inside)):
-                if file.suffix == ".html":
-                    found.setdefault(name, file)
-        return {
-            name: file
-            for name, file in found.items()
-            if REPORT_NAME.fullmatch(name) and is_plain_file(file) and not file.is_symlink()
-        }
+            raise NotKnown("report_unknown", f"run {name} has no report: {error.reason}") from None
 
 
 def known_boards() -> dict[str, Path]:
@@ -254,22 +216,3 @@ def board_bytes(known: str | None, text: str | None) -> tuple[bytes, AnyBoard]:
 
 def _unwritable(place: str, error: OSError) -> Unable:
     return Unable("unwritable", f"{place}: {error.strerror or error}")
-
-
-def _entries(folder: Path) -> list[Path]:
-    try:
-        return sorted(folder.iterdir())
-    except OSError:
-        return []
-
-
-def _report_summary(name: str, path: Path) -> ReportSummary | None:
-    try:
-        with path.open("rb") as file:
-            head = file.read(4096)
-        written = datetime.fromtimestamp(path.stat().st_mtime, UTC).isoformat(timespec="seconds")
-    except OSError:
-        return None
-    found = _TITLE.search(head)
-    title = html.unescape(found[1].decode(errors="replace")) if found else name
-    return {"name": name, "title": " ".join(title.split()), "written": written}

@@ -40,11 +40,11 @@ def work(job: BenchJob, link: Connection) -> None:
     try:
         with Client(job.url, name=HOLDER, token=job.token) as client:
             client.use_lease(job.lease_id)
-            board = load_board(job.board)
+            board = load_board(job.folder.board)
             reporter.change(board_m=list(board.size_m))
             goal = BenchGoal(job.run["wanted_px"], job.run["most"])
-            bench = open_run(client, board, job.survey, reporter, goal)
-            reporter.done(finish(bench, reporter, job.out, job.report).as_json())
+            bench = open_run(client, board, job.folder.seen, reporter, goal)
+            reporter.done(finish(bench, reporter, job.out, job.folder.page.parent).as_json())
     except Exception as error:
         body = error_body(error)
         if body["code"] == "internal":

@@ -107,12 +107,8 @@ class Calls:
         """
         return self.daemon.command(answers.BenchRuns, "DELETE", f"/bench/runs/{escaped(name)}")
 
-    def reports(self) -> answers.ReportList:
-        """Return the reports that can be read, the newest first."""
-        return self.daemon.json(answers.ReportList, "GET", "/reports")
-
     def report(self, name: str) -> bytes:
-        """Return a report, HTML."""
+        """Return the report of a bench calibration, HTML."""
         return self.daemon.request("GET", f"/reports/{escaped(name)}").content
 
     def recordings(self) -> answers.Recordings:

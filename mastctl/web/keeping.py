@@ -1,4 +1,4 @@
-"""Routes of what a daemon keeps: mast files, places, recordings, its configuration, benches and reports."""
+"""Routes of what a daemon keeps: mast files, places, recordings, its configuration, benches."""
 
 from __future__ import annotations
 
@@ -31,13 +31,6 @@ PlaceName = Annotated[
 ]
 RunName = Annotated[
     str, Path(pattern=f"^{NAME.pattern}$", description="a run's name, such as 20261126-093000,")
-]
-ReportName = Annotated[
-    str,
-    Path(
-        pattern="^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$",
-        description="1 to 100 letters a to z, digits, '.', '_' and '-', the first a letter or digit,",
-    ),
 ]
 
 
@@ -135,7 +128,7 @@ def add_recordings(app: FastAPI) -> None:
 
 
 def add_bench(app: FastAPI) -> None:
-    """A bench calibration begun, answered, ended; reports."""
+    """A bench calibration begun, answered, ended; its report."""
 
     @app.get(f"{PREFIX}/bench", summary="The bench calibration at work, and those that are kept")
     async def bench(here: Here) -> answers.BenchRuns:
@@ -162,18 +155,13 @@ def add_bench(app: FastAPI) -> None:
         """Remove a bench calibration that is over, pictures and report."""
         return here.service.bench.forget(name)
 
-    @app.get(f"{PREFIX}/reports", summary="The reports that can be read")
-    async def listed(here: Here) -> answers.ReportList:
-        runs = here.service.bench.runs
-        return {"reports": await here.waiting.run(runs.reports), "folder": str(runs.reports_folder)}
-
     @app.get(
         f"{PREFIX}/reports/{{name}}",
-        summary="A report",
+        summary="The report of a bench calibration",
         response_class=Response,
         responses=file_of("text/html"),
     )
-    async def report(name: ReportName, here: Here) -> Response:
+    async def report(name: RunName, here: Here) -> Response:
         page = await here.waiting.run(lambda: here.service.bench.runs.report(name))
         headers = {"Content-Security-Policy": REPORT, "Cross-Origin-Opener-Policy": "same-origin"}
         return Response(page, media_type="text/html; charset=utf-8", headers=headers)

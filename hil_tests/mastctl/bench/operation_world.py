@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import shutil
 import signal
@@ -17,7 +18,7 @@ from drivers.clock import SystemClock
 from hil_tests.waiting import NET_S, until
 from mastctl.answers import BenchRunRecord
 from mastctl.bench.operation import BenchOperation
-from mastctl.bench.runs import BenchJob
+from mastctl.bench.runs import HOLDER, BenchJob
 from mastctl.control.lease import LeaseTable
 from mastctl.control.publisher import Publisher
 
@@ -95,17 +96,22 @@ def says_lease_and_token(job: BenchJob, link: Connection) -> Mapping[str, Any]:
 
 
 def says_folder(job: BenchJob, link: Connection) -> Mapping[str, Any]:
-    return {"sentences": [job.survey.parent.name]}
+    return {"sentences": [job.folder.name]}
 
 
 def writes_files(job: BenchJob, link: Connection) -> Mapping[str, Any]:
     """Leave a mast file, if there is one to copy, and a report."""
     for one in job.out.parent.glob("little.yaml"):
         shutil.copy(one, job.out)
-    job.report.mkdir()
+    job.folder.page.parent.mkdir()
     page = "<title>Bench</title><h1>Residuals</h1><script>document.title = 1</script>"
-    (job.report / "bench.html").write_text(page)
+    job.folder.page.write_text(page)
     return {}
+
+
+def worker_pid() -> int | None:
+    """The process of the worker, if one is at work."""
+    return next((child.pid for child in multiprocessing.active_children() if child.name == HOLDER), None)
 
 
 @dataclass

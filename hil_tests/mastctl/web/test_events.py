@@ -76,15 +76,6 @@ def test_it_begins_with_what_is_known_and_then_tells_each_change(pair: BOTH) -> 
         assert [step["name"] for step in ended["value"]["steps"]] == ["look", "measure"]
 
 
-REQUEST = {
-    "begun": "2026-11-22T12:00:00+00:00",
-    "by": "Ana",
-    "by_hand": True,
-    "wanted_px": 0.2,
-    "pictures": 60,
-}
-
-
 def test_each_topic_is_told_by_the_model_that_openapi_describes(pair: BOTH) -> None:
     daemon, _ = pair
     with httpx.Client(base_url=daemon.url, **PLAIN) as http:
@@ -97,7 +88,9 @@ def test_each_topic_is_told_by_the_model_that_openapi_describes(pair: BOTH) -> N
         http.get("/api/v1/snapshot/navcam_left")
     publisher = daemon.service.machine.publisher
     publisher.publish("fault", "a device", ())
-    publisher.publish("bench", "run", {**new_record("20261122-120000", REQUEST, True), **BEGUN, **PLACE})
+    publisher.publish(
+        "bench", "run", {**new_record("20261122-120000", "Ana", "charuco", True), **BEGUN, **PLACE}
+    )
     seen: set[str] = set()
     with socket_of(daemon.url) as line:
         for _ in range(200):

@@ -11,7 +11,6 @@ import { History } from "./history.js";
 import { Jog } from "./jog.js";
 import { OperationList } from "./operations.js";
 import { PanoramaPanel } from "./panorama.js";
-import { Reports } from "./reports.js";
 import { Residuals } from "./residuals.js";
 import { Settings } from "./settings.js";
 import { Simulation } from "./simulation.js";
@@ -88,7 +87,6 @@ new Faults(events, announce);
 new Failure(events, announce);
 new OperationList(events);
 const bench = new Bench(events, speak);
-new Reports(events);
 new History(events);
 
 // What is pushed

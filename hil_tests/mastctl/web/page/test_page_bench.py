@@ -11,7 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.mastctl.bench.operation_world import BEGUN, DONE, PROGRESS, answered, script, writes_files
+from hil_tests.mastctl.bench.operation_world import (
+    BEGUN,
+    DONE,
+    PROGRESS,
+    answered,
+    script,
+    worker_pid,
+    writes_files,
+)
 from hil_tests.mastctl.service_fakes import FakeHardware, fake_daemon
 from hil_tests.mastctl.web.page.conftest import Visit
 from hil_tests.waiting import present
@@ -60,7 +68,7 @@ def test_stop_ends_it_says_so_and_it_goes_on_from_there(pair: BOTH, visit: Visit
     one = visit(daemon.url)
     begin(one)
     one.page.wait_for_selector(".curve")
-    pid = bench.pid
+    pid = worker_pid()
     assert pid is not None
     one.page.locator("#bench").press("Escape")
     one.page.wait_for_selector(".bench-verdict:has-text('the head was stopped by')")
