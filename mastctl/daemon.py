@@ -83,7 +83,9 @@ def run(
     """
     sys.setswitchinterval(SWITCH_S)
     with _listening(config.listen) as (listener, url):
-        service = _opened(config, clock, _state_folder(config), url)
+        any_port = config.listen.socket is None and config.listen.port == 0  # it is not found there again
+        folder = StateFolder.of(config.state_folder, config.path, None if any_port else config.listen.url)
+        service = _opened(config, clock, folder, url)
         _let_log_stall(service)
         try:
             rules = _entry_rules(service, url)
@@ -166,13 +168,6 @@ class RunningDaemon:
             self._ended.set()
             self._ready.set()
             self._stop = lambda: None
-
-
-def _state_folder(config: Config) -> StateFolder:
-    """The folder of a daemon's own process; a temporary one at any free port, where it is not found again."""
-    if config.listen.socket is None and config.listen.port == 0:
-        return StateFolder.named(config.state_folder) or StateFolder.temporary()
-    return StateFolder.of(config.state_folder, config.path, config.listen.url)
 
 
 def _opened(config: Config, clock: Clock | None, folder: StateFolder | None, url: str) -> Service:

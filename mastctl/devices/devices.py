@@ -79,6 +79,8 @@ class Devices(Cameras):
     ----------
     on_turn
         Called in the head's own thread each time it is about to read, whatever comes of that; must not wait.
+    latched
+        Returns what refuses every move while an emergency stop is latched; must not wait.
     reports
         Where each axis was sent and is in counts; empty for a head that does not know. Never edited.
 
@@ -100,6 +102,7 @@ class Devices(Cameras):
         self._machine = machine or StateMachine(clock)
         self._publisher = self._machine.publisher
         self.on_turn: Callable[[], None] = lambda: None
+        self.latched: Callable[[], Stopped | None] = lambda: None
         self._pan_tilt = hardware.pan_tilt
         self.judge = KeepOutJudge(limits, hardware.pan_tilt, clock, HEAD, rig, sun)
         deadlines = deadlines_on(clock)
@@ -107,7 +110,7 @@ class Devices(Cameras):
         history = JointHistory(self._joints)
         store = FrameStore(mast_digest, new_run=new_run, on_new=self._new_frame)
         self._gate = threading.Lock()
-        self._blocks: dict[object, Stopped] = {}  # why no move is let out, by holder
+        self._blocks: dict[object, str] = {}  # why no move is let out, by holder
         self._closed = False
         self.reports: Mapping[str, AxisReport] = {}
         self._reported_s: Mapping[str, float] = {}  # what the head reports about itself, and since when
@@ -193,10 +196,12 @@ class Devices(Cameras):
         goal = float(pan_rad), float(tilt_rad)
 
         def check_free() -> None:
+            refusal = self.latched()
+            if refusal is not None:
+                raise refusal
             with self._gate:
                 if self._blocks:
-                    why = next(iter(self._blocks.values()))
-                    raise type(why)(str(why))
+                    raise Stopped(next(iter(self._blocks.values())))
             self._stops.check(ticket)
 
         def send() -> None:
@@ -234,17 +239,10 @@ class Devices(Cameras):
         """Return whether every stop has come back from the driver within ``timeout_s`` seconds."""
         return self._stops.returned(timeout_s)
 
-    def block_moves(self, holder: object, reason: str | Stopped) -> None:
-        """Refuse every further move until the holder (any key) allows them again.
-
-        ``reason`` is a sentence, or the refusal itself, which then comes before those of others.
-        """
+    def block_moves(self, holder: object, reason: str) -> None:
+        """Refuse every further move until the holder (any key) allows them again."""
         with self._gate:
-            others = {other: why for other, why in self._blocks.items() if other is not holder}
-            if isinstance(reason, Stopped):
-                self._blocks = {holder: reason, **others}
-            else:
-                self._blocks = {**others, holder: Stopped(reason)}
+            self._blocks[holder] = reason
 
     def allow_moves(self, holder: object) -> None:
         """Take back what this holder blocked; moves go out when none is left."""

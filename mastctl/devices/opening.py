@@ -27,7 +27,7 @@ from mastctl.devices.devices import HEAD, Devices
 from mastctl.devices.judge import KeepOutJudge, Limits, SunDirection
 from mastctl.errors import Stopped
 from mastctl.safety.latch import Estopped, latched_at
-from mastctl.safety.state_folder import StateFolder, other_head_folders, take_head
+from mastctl.safety.state_folder import StateFolder, head_folders, take_head
 
 STILL = "this program moves no head"
 
@@ -187,16 +187,15 @@ def _locked(name: str, *, moves: bool, state: Path | None = None) -> Iterator[No
     place = take_head(name)
     try:
         if moves:
-            _check_latch(name, place, state)
+            _check_latch(name, state)
         yield
     finally:
         if place is not None:
             place.close()
 
 
-def _check_latch(name: str, place: StateFolder | None, state: Path | None) -> None:
+def _check_latch(name: str, state: Path | None) -> None:
     """Pass a head whose emergency stop is not latched. Raises Estopped."""
-    folders = [folder for folder in (None if place is None else place.path, state) if folder is not None]
-    entries = latched_at(folders, other_head_folders(name, place))
+    entries = latched_at([*head_folders(name), *([] if state is None else [state])])
     if entries:
         raise Estopped(f"{latched_sentence(entries)} at the head's daemon; until then nothing moves the head")

@@ -1,21 +1,20 @@
 """The latch of a head: in memory from the first moment, and on the disk across restarts.
 
-It is kept in the head's folder (`mastctl.safety.state_folder`), or in the state folder for a head in this
-program's memory. It keeps a log of its causes, and a reset releases all of them.
+It lies in the head's folder (`mastctl.safety.state_folder`), or in the state folder for a head in this
+program's memory. It has a log of its causes, and a reset releases all of them.
 
-A file that cannot be read means latched: so a stop is written over the file of a released latch, which exists
-from the start, and quick. The stop never waits for the disk: a thread of its own writes, after the head was
-stopped, and tries again for as long as the disk refuses.
+A file that cannot be read means latched, so a stop is written over the file of a released latch, which exists
+from the start, and quickly. The stop never waits for the disk: a thread writes, after the head was stopped,
+and tries again for as long as the disk refuses.
 """
 
 from __future__ import annotations
 
 import contextlib
-import itertools
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -30,12 +29,8 @@ log = logging.getLogger(__name__)
 
 SCHEMA = "mastctl/latch/1"
 FILE = "latch.json"
-USED_SCHEMA = "mastctl/latch-used/1"
-USED = "latch.used.json"
-"""Names a place where a latch file was: where it is gone, its content is unknown."""
-NO_NAME, NO_REASON = "anonymous", "no reason given"
+BARE = "anonymous", "no reason given"  # name and reason of a stop that came without
 MOST = 5  # causes: strangers with many names fill no disk
-HEAD_FIRST_S = 0.1  # how long the disk waits for the head's stop, at most
 AGAIN_S = 2.0
 PATIENCE_S = 2.0  # of a reset for a disk that is busy
 ROOM_BYTES = 32768  # for the longest reasons and names of all entries, however they are written
@@ -52,55 +47,40 @@ class Estopped(Stopped):
 class Latch:
     """The emergency stop of one head; safe to use from any thread.
 
-    ``folder``: where the causes are kept; ``state``: the daemon's state folder, if that is another one; it
-    remembers where the latch is; ``others``: folders beside them: what is latched there counts too, and is
+    ``folder`` is where the causes are written; what is latched in the folders ``others`` counts too, and is
     released there too.
 
-    ``entries``: the causes, the oldest first, empty if nothing is latched; read without a lock; ``since_s``:
+    ``entries``: the causes, the oldest first, empty if nothing is latched; read without a lock. ``since_s``:
     when the first one was latched in this process, seconds of CLOCK_MONOTONIC.
     """
 
-    def __init__(
-        self, folder: StateFolder, state: StateFolder | None = None, others: Sequence[Path] = ()
-    ) -> None:
+    def __init__(self, folder: StateFolder, others: Sequence[Path] = ()) -> None:
         self.folder = folder
         self._file = _file_in(folder.path)
-        places = [folder.path] if state is None else [folder.path, state.path]
-        self._marks = _marks_in(places)
-        self._others = [_file_in(other) for other in (*others, *places[1:])]
-        self._changed = threading.Condition()
-        self._disk = threading.Lock()  # for writers; a disk that hangs holds no other thread
-        self.entries: tuple[Latched, ...] = ()
-        self._kept: tuple[Latched, ...] | None = ()  # what a restart would find latched
-        self._problem = ""
-        self._count = 0  # of requests
+        self._others = [_file_in(other) for other in others if other != folder.path]
+        self.entries = latched_at([folder.path, *(other.path.parent for other in self._others)])
         self.since_s = time.monotonic()
-        self._due_s = 0.0  # when the disk may be written to
+        self._on_disk: tuple[Latched, ...] | None = self.entries  # what a restart would find, None: unknown
+        self._problem = ""  # why the disk refused the last time
+        self._count = 0  # of requests
+        self._changed = threading.Condition()
+        self._disk = threading.Lock()  # for writers; a disk that hangs blocks no other thread
         self._ended = False
-        found = _entries(self._file)
-        self.entries = _gone(self._file, self._marks) if found is None else found
-        self.entries = _merged(self.entries, *(_entries(other) or () for other in self._others))
-        self._kept = self.entries if self.entries == (found or ()) else found
-        self._on_disk = bool(self.entries)  # whether a restart may find one, this one or another
         if self.entries:
             log.warning("%s", latched_sentence(self.entries))
-        threading.Thread(target=self._keep, name="latch", daemon=True).start()
+        threading.Thread(target=self._work, name="latch", daemon=True).start()
 
     def add(self, reason: str | None, name: str | None) -> Latched:
-        """Latch in memory, at once; return the cause. The log keeps each once, and the first `MOST`.
+        """Latch in memory, at once; return the cause. The log has each once, and the first `MOST`.
 
-        The disk is written to when `head_stopped` is called, or a moment later.
+        `keep` has it written, once the head was stopped.
         """
+        cause = Latched(_line(name) or BARE[0], _line(reason) or BARE[1], _now())
         with self._changed:
             self._count += 1
-            cause = Latched(_line(name, NO_NAME), _line(reason, NO_REASON), _now())
-            before = self.entries
-            self.entries = _merged(before, (cause,))
-            if self.entries is not before:
-                now_s = time.monotonic()
-                self.since_s = self.since_s if before else now_s
-                self._due_s = now_s + HEAD_FIRST_S
-                self._changed.notify_all()
+            if not self.entries:
+                self.since_s = time.monotonic()
+            self.entries = _merged((*self.entries, cause))
             return next((one for one in self.entries if _same(one, cause)), cause)
 
     def explain(self, reason: str | None, name: str | None) -> Latched | None:
@@ -109,45 +89,30 @@ class Latch:
         None if there is no such cause.
         """
         with self._changed:
-            bare = next((one for one in self.entries if (one.name, one.reason) == (NO_NAME, NO_REASON)), None)
+            bare = next((one for one in self.entries if (one.name, one.reason) == BARE), None)
             if bare is None:
                 return None
             self._count += 1  # a reset that is under way has not released this
-            cause = replace(bare, name=_line(name, NO_NAME), reason=_line(reason, NO_REASON))
-            self.entries = _merged((), tuple(cause if one is bare else one for one in self.entries))
+            cause = replace(bare, name=_line(name) or BARE[0], reason=_line(reason) or BARE[1])
+            self.entries = _merged(cause if one is bare else one for one in self.entries)
             self._changed.notify_all()
             return cause
 
-    def head_stopped(self) -> None:
-        """Let the disk be written to: the head comes first."""
+    def keep(self, timeout_s: float) -> bool:
+        """Have the disk hold what is latched; return whether it does within ``timeout_s`` seconds."""
         with self._changed:
-            self._due_s = 0.0
             self._changed.notify_all()
-
-    def kept_within(self, timeout_s: float) -> bool:
-        """Wait ``timeout_s`` seconds at most for the disk to hold what is latched; return whether it does."""
-        until_s = time.monotonic() + timeout_s
-        with self._changed:
-            while self._kept is not self.entries and not self._problem:
-                left_s = until_s - time.monotonic()
-                if left_s <= 0:
-                    break
-                self._changed.wait(left_s)
-            return self.survives
-
-    @property
-    def survives(self) -> bool:
-        """Whether a restart would find what is latched."""
-        return self._kept is self.entries and not self.folder.is_temporary
+            self._changed.wait_for(lambda: self._on_disk == self.entries or self._problem, timeout_s)
+        return not self.not_kept
 
     @property
     def not_kept(self) -> str:
-        """Why an emergency stop is not kept, one sentence; empty if it is, or none is latched."""
-        if not self.entries or self.survives:
+        """Why a restart would not find what is latched, one sentence; empty if it would, or nothing is."""
+        if not self.entries:
             return ""
         if self.folder.is_temporary:
             return self.folder.why_temporary or "this daemon keeps its state in a temporary folder"
-        return self._problem or "the disk has not confirmed it yet"
+        return "" if self._on_disk == self.entries else self._problem or "the disk has not confirmed it yet"
 
     def release(self, reason: str, name: str) -> tuple[Latched, ...]:
         """Release the latch on the disk, then in memory; return its causes.
@@ -155,7 +120,7 @@ class Latch:
         Raises NotNow ``not_estopped`` if none is latched, ``stopping`` if another stop came meanwhile; Unable
         ``not_saved`` if the disk still has the stop: a restart would be latched again.
         """
-        name, reason = _line(name, ""), _line(reason, "")
+        name, reason = _line(name), _line(reason)
         if not self._disk.acquire(timeout=PATIENCE_S):
             message = "the disk has not taken the emergency stop yet; a reset follows it"
             raise Unable("not_saved", message, PATIENCE_S)
@@ -163,194 +128,97 @@ class Latch:
             causes, count = self.entries, self._count
             if not causes:
                 raise NotNow("not_estopped", "no emergency stop is latched")
-            with self._changed:  # before the disk changes: from here on no answer states that it has the stop
-                self._kept = None
-            if self._on_disk:
-                released = {"by": name, "reason": reason, "at": _now()}
-                self._write_released({"latched": False, **asdict(causes[0]), "released": released})
+            self._on_disk = None  # from here on no answer states that the disk has the stop
+            released = {"by": name, "reason": reason, "at": _now()}
+            document = {"latched": False, **asdict(causes[0]), "released": released}
+            for file in (*self._others, self._file):
+                if _entries(file):
+                    file.overwrite(document)
             with self._changed:
-                self._changed.notify_all()
                 if count != self._count:
                     raise NotNow("stopping", "another emergency stop came during the reset; it is latched")
-                self.entries = self._kept = ()
+                self.entries = self._on_disk = ()
                 self._problem = ""
+        except BadFile as error:
+            message = f"the emergency stop stays latched, since its release cannot be kept: {error}"
+            raise Unable("not_saved", message) from None
         finally:
             self._disk.release()
+            self.keep(0.0)  # after a refusal the stop is written again
         listed = "; ".join(f"{one.name}: {one.reason}" for one in causes)
         log.warning("the emergency stop (%s) is released by %s: %s", listed, name, reason)
         return causes
 
     def close(self) -> None:
-        """End the thread, after what is to be kept was tried once more."""
+        """End the thread, after one more try for what is not on the disk."""
         with self._changed:
             self._ended = True
-            self._due_s = 0.0
             self._changed.notify_all()
 
-    def _write_released(self, document: dict[str, Any]) -> None:
-        """Write to the disk that nothing is latched. Raises Unable."""
-
-        def remove() -> None:
-            for file in (*self._marks, self._file):  # without its mark the file is not missed
-                file.remove()
-
-        ways: tuple[Callable[[], None], ...] = (
-            lambda: self._file.write(document),
-            lambda: self._file.overwrite(document),  # a full disk still takes this, and the room stays
-            remove,  # and this one that cannot be written to
-        )
-        refused = ""
-        for file in self._others:
-            try:
-                if _entries(file):
-                    file.write(document)
-            except BadFile as error:
-                refused = str(error)
-        for way in () if refused else ways:
-            try:
-                way()
-            except BadFile as error:
-                refused = refused or str(error)
-            else:
-                self._on_disk = False
-                return
-        with self._changed:  # what the disk says is not known: the thread writes it again
-            self._changed.notify_all()
-        message = f"the emergency stop stays latched, since its release cannot be kept: {refused}"
-        raise Unable("not_saved", message)
-
-    def _keep(self) -> None:
+    def _work(self) -> None:
         """Write what is latched, in a thread of its own."""
-        with self._disk:
-            if not self.entries and not self.folder.is_temporary and not self._file.has_room:
-                with contextlib.suppress(BadFile):  # then a stop is written anew, and reports the fault
-                    self._file.write({"latched": False})
-            self._mark()
-        while True:
+        with self._disk, contextlib.suppress(BadFile):  # without it a stop is written anew, and reports why
+            if not self._file.path.exists():
+                self._file.write({"latched": False})
+        while not self._ended:
             with self._changed:
-                while self.entries is self._kept or time.monotonic() < self._due_s:
-                    if self._ended:
-                        return
-                    left_s = self._due_s - time.monotonic()
-                    self._changed.wait(None if self.entries is self._kept else max(0.0, left_s))
+                if self._problem and not self._ended:
+                    self._changed.wait(AGAIN_S)
+                while not self._ended and self._on_disk == self.entries:
+                    self._changed.wait()
             with self._disk:
-                entries = self.entries
-                if not entries:
-                    continue
-                try:
-                    self._write(entries)
-                    self._mark()
-                    problem = ""
-                except BadFile as error:
-                    problem = str(error)
-                self._tried(entries, problem)
-
-    def _mark(self) -> None:
-        """Remember that the file is there, once it is."""
-        if self.folder.is_temporary or not self._file.path.exists():
-            return
-        for mark in self._marks:
-            with contextlib.suppress(BadFile):
-                if not _names(mark, self._file):
-                    mark.write({"latch": str(self._file.path)})
+                if self._on_disk != self.entries:
+                    self._write(self.entries)
 
     def _write(self, entries: tuple[Latched, ...]) -> None:
-        """Have causes on the disk. Raises BadFile."""
-        document = _document(entries)
+        problem, (first, *more) = "", entries
+        document: dict[str, Any] = {"latched": True, **asdict(first)}
         try:
-            try:
-                self._file.overwrite(document)
-            except BadFile:  # no file with room for it, or one that cannot be written to any more
-                self._file.write(document)
-        except BadFile:
-            self._on_disk = self._on_disk or bool(_entries(self._file))
-            raise
-        self._on_disk = True
-
-    def _tried(self, entries: tuple[Latched, ...], problem: str) -> None:
-        """Note how the writing went, and log each change once."""
+            self._file.overwrite(document | ({"more": [asdict(one) for one in more]} if more else {}))
+        except BadFile as error:
+            problem = str(error)
         if problem and problem != self._problem:
             log.error("the emergency stop would not survive a restart: %s", problem)
         with self._changed:
-            if not problem:
-                self._kept = entries
             self._problem = problem
-            self._due_s = time.monotonic() + AGAIN_S if problem else 0.0
+            if not problem:
+                self._on_disk = entries
             self._changed.notify_all()
-            if problem and self._ended:
-                self._kept = entries  # nothing more can be done
 
 
-def latched_at(folders: Sequence[Path], others: Sequence[Path]) -> tuple[Latched, ...]:
-    """Return the causes of a head's latch, for a program that only reads.
-
-    ``folders`` are its place and the state folder, as far as they are known; ``others`` as of `Latch`.
-    """
-    entries: tuple[Latched, ...] = ()
-    if folders:
-        file = _file_in(folders[0])
-        found = _entries(file)
-        entries = _gone(file, _marks_in(folders)) if found is None else found
-    return _merged(entries, *(_entries(_file_in(other)) or () for other in (*others, *folders[1:])))
-
-
-def _marks_in(folders: Sequence[Path]) -> list[StateFile]:
-    return [StateFile(folder / USED, USED_SCHEMA) for folder in folders]
+def latched_at(folders: Iterable[Path]) -> tuple[Latched, ...]:
+    """Return the causes of a head's latch, wherever they lie."""
+    return _merged(one for folder in folders for one in _entries(_file_in(folder)))
 
 
 def _file_in(folder: Path) -> StateFile:
     return StateFile(folder / FILE, SCHEMA, ROOM_BYTES, 0o644)
 
 
-def _names(mark: StateFile, file: StateFile) -> bool:
-    """Whether a mark names a latch file; one that cannot be read is treated so too."""
-    try:
-        content = mark.read()
-    except BadFile:
-        return True
-    return content is not None and content.get("latch") == str(file.path)
-
-
-def _gone(file: StateFile, marks: Sequence[StateFile]) -> tuple[Latched, ...]:
-    """What is latched where there is no latch file: nothing, unless there was one."""
-    if not any(_names(mark, file) for mark in marks):
-        return ()
-    reason = f"whether one was latched is not known, since {file.path} is gone"
-    return (Latched("mastctl", one_line(reason, LONGEST), _now()),)
-
-
-def _entries(file: StateFile) -> tuple[Latched, ...] | None:
-    """The causes in a latch file, None without a file; one that cannot be read means latched."""
+def _entries(file: StateFile) -> Sequence[Latched]:
+    """The causes in a latch file; one that cannot be read means latched."""
     try:
         document = file.read()
     except BadFile as error:
-        return (Latched("mastctl", f"whether one was latched cannot be read: {error}", _now()),)
-    if document is None:
-        return None
-    if document.get("latched") is False:
+        return [Latched("mastctl", f"whether one was latched cannot be read: {error}", _now())]
+    if document is None or document.get("latched") is False:
         return ()
     more = document.get("more")
     parts = [document, *(more if isinstance(more, list) else ())]
-    found = (
-        Latched(*(_text(one.get(key)) for key in ("name", "reason", "at")))
+    return [
+        Latched(*(_line(one.get(key)) or "not stated" for key in ("name", "reason", "at")))
         for one in parts[:MOST]
-        if isinstance(one, Mapping)
-    )
-    return _merged((), tuple(found))
+        if isinstance(one, dict)
+    ]
 
 
-def _document(entries: tuple[Latched, ...]) -> dict[str, Any]:
-    """As a file has them: the oldest at the top, as one alone always was."""
-    first, *more = entries
-    return {"latched": True, **asdict(first)} | ({"more": [asdict(one) for one in more]} if more else {})
-
-
-def _merged(entries: tuple[Latched, ...], *more: tuple[Latched, ...]) -> tuple[Latched, ...]:
-    """Causes with further ones, `MOST` at most; the same tuple if there are none."""
-    for one in itertools.chain(*more):
-        if len(entries) < MOST and not any(_same(one, other) for other in entries):
-            entries = (*entries, one)
-    return entries
+def _merged(entries: Iterable[Latched]) -> tuple[Latched, ...]:
+    """The causes, each once, `MOST` at most."""
+    merged: list[Latched] = []
+    for one in entries:
+        if len(merged) < MOST and not any(_same(one, other) for other in merged):
+            merged.append(one)
+    return tuple(merged)
 
 
 def _same(one: Latched, other: Latched) -> bool:
@@ -361,10 +229,6 @@ def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
-def _line(text: str | None, otherwise: str) -> str:
-    """One line of bounded length."""
-    return one_line(text or "", LONGEST) or otherwise
-
-
-def _text(value: object) -> str:
-    return one_line(value, LONGEST) if isinstance(value, str) else "not stated"
+def _line(text: object) -> str:
+    """One line of bounded length; empty for what is no text."""
+    return one_line(text, LONGEST) if isinstance(text, str) else ""

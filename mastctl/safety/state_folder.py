@@ -25,7 +25,7 @@ import pwd
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from glob import escape
 from pathlib import Path
@@ -102,53 +102,34 @@ class StateFile:
         """
         from calib.files import replace_bytes
 
-        with self._refused("saved"):
+        try:
             replace_bytes(self.path, self._data(document).ljust(self.room), self.mode)
+        except OSError as error:
+            raise BadFile(self.path, "", f"cannot be saved: {error.strerror or error}") from None
 
     def overwrite(self, document: Mapping[str, Any]) -> None:
-        """Write a document over the former one, as quickly as can be; when this returns it is on the disk.
+        """Write a document over the former one, quickly; when this returns it is on the disk.
 
         A crash meanwhile may leave a file that cannot be read: only for what then counts as this document.
-        Raises as `write`, and BadFile if there is no file with room for it.
+        Where no file has room for it, it is written anew. Raises as `write`.
         """
         from calib.files import overwrite_bytes
 
-        with self._refused("overwritten"):
-            overwrite_bytes(self.path, self._data(document))
-
-    def remove(self) -> None:
-        """Remove the file; when this returns it is gone from the disk too. Raises BadFile."""
-        from calib.files import remove
-
-        with self._refused("removed"):
-            remove(self.path)
-
-    @property
-    def has_room(self) -> bool:
-        """Whether there is a file that can be written over."""
         try:
-            return self.path.stat().st_size >= self.room
+            overwrite_bytes(self.path, self._data(document))
         except OSError:
-            return False
+            self.write(document)
 
     def _data(self, document: Mapping[str, Any]) -> bytes:
         text = json.dumps({"schema": self.schema, **document}, indent=1, allow_nan=False)
         return f"{text}\n".encode()
-
-    @contextlib.contextmanager
-    def _refused(self, done: str) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise BadFile(self.path, "", f"cannot be {done}: {error.strerror or error}") from None
 
 
 class StateFolder:
     """A folder that is this program's alone until it is closed; `of`, `temporary` and `take_head` make one.
 
     ``is_temporary``: it goes when it is closed; ``why_temporary``: why what is kept there is lost with this
-    daemon, though that was not wanted; ``refused``: why the disk refused what was to be written at the start;
-    both empty otherwise.
+    daemon, though that was not wanted, else empty.
     """
 
     def __init__(
@@ -157,7 +138,6 @@ class StateFolder:
         self.path = path
         self.is_temporary = is_temporary
         self.why_temporary = why_temporary
-        self.refused = ""
         try:
             self._lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         except OSError as error:
@@ -180,40 +160,38 @@ class StateFolder:
         return cls(Path(tempfile.mkdtemp(prefix="mastctl-state-")), is_temporary=True, why_temporary=why)
 
     @classmethod
-    def of(cls, named: Path | None, config: Path, address: str) -> StateFolder:
+    def of(cls, named: Path | None, config: Path, address: str | None) -> StateFolder:
         """Take the folder of a configuration and an address, and make it if it does not exist.
 
-        A usual place that cannot be made is replaced by a temporary one, since nothing can be kept there; one
-        that was ``named`` (``state.folder``) is insisted upon, since something may. Raises BadFile,
-        StateInUse.
+        ``address`` is None for one that does not come again: without a ``named`` folder (``state.folder``, or
+        that of systemd) it is temporary. A usual place that cannot be made is replaced by a temporary one,
+        since nothing can be kept there; one that was named is insisted upon, since something may. Raises
+        BadFile, StateInUse.
         """
-        found = cls.named(named)
-        if found is not None:
-            return found
-        try:
-            path = usual_folder(config, address)
-            _made(path)
-        except (BadFile, RuntimeError) as error:  # RuntimeError: this user has no home
-            return cls.temporary(str(error))
-        return cls(path)
-
-    @classmethod
-    def named(cls, named: Path | None) -> StateFolder | None:
-        """Take the folder of the configuration or of systemd as `of`; None where neither names one."""
-        path = named or _of_systemd()
+        path = named = named or _of_systemd()
         if path is None:
-            return None
-        _made(path)
+            if address is None:
+                return cls.temporary()
+            try:
+                path = usual_folder(config, address)
+            except RuntimeError as error:  # this user has no home
+                return cls.temporary(str(error))
+        try:
+            path.mkdir(mode=0o700, parents=True, exist_ok=True)
+        except OSError as error:
+            bad = BadFile(path, "", f"the state folder cannot be made: {error.strerror or error}")
+            if named is None:
+                return cls.temporary(str(bad))
+            raise bad from None
         return cls(path)
 
     def note_daemon(self, config: Path, url: str, stop_socket: Path | None) -> None:
-        """Write which daemon uses this folder, for commands that find it; `refused` has a disk's refusal."""
+        """Write which daemon uses this folder, for commands that find it."""
         content = {"pid": os.getpid(), "url": url, "config": str(config.resolve())}
         try:
             note = StateFile(self.path / DAEMON_FILE, DAEMON_SCHEMA)
             note.write({**content, "stop_socket": str(stop_socket)})
         except BadFile as error:
-            self.refused = str(error)
             log.error("the state folder cannot be written: %s", error)
 
     def close(self) -> None:
@@ -231,7 +209,10 @@ class StateFolder:
 
 
 def usual_folder(config: Path, address: str) -> Path:
-    """Return the usual place of a daemon: the configuration's name, and digits of its path and address."""
+    """Return the usual place of a daemon: the configuration's name, and digits of its path and address.
+
+    Raises RuntimeError for a user without a home.
+    """
     digits = _digits(os.fsencode(f"{config.resolve()}\n{address}"))
     return _state_home() / f"{config.stem}-{digits}"
 
@@ -246,21 +227,25 @@ def folder_of(named: Path | None, config: Path, address: str) -> Path | None:
 def folders_of(config: Path | None) -> list[Path]:
     """Return the folders in which a daemon's state may be, of one configuration or of any, as far as known.
 
-    Only those that exist, those of all heads too; for a program that cannot, or need not, read the
-    configuration.
+    Those of all heads too; for a program that cannot, or need not, read the configuration.
     """
-    found = [path for path in [_of_systemd()] if path is not None and path.is_dir()]
+    found = [path for path in [_of_systemd()] if path is not None]
     stem = "*" if config is None else escape(config.stem)
     with contextlib.suppress(OSError, RuntimeError):
-        found += sorted(path for path in _state_home().glob(f"{stem}-????????") if path.is_dir())
+        found += sorted(_state_home().glob(f"{stem}-????????"))
     for parent in _heads_parents():
         with contextlib.suppress(OSError):
-            found += sorted(path for path in parent.iterdir() if path.is_dir())
+            found += sorted(parent.iterdir())
     return found
 
 
-def head_folders(name: str) -> list[Path]:
-    """Return the folders in which a head's latch may lie, the one that is preferred first."""
+def head_folders(name: str | None) -> list[Path]:
+    """Return the folders in which a head's latch may lie, the one that is preferred first.
+
+    None for a head without a name.
+    """
+    if name is None:
+        return []
     folder = f"{re.sub(r'[^A-Za-z0-9._-]', '_', name)[:80]}-{_digits(name.encode())}"
     given = os.environ.get(VARIABLE, "")
     if given and _SIMULATED.match(name):
@@ -284,37 +269,24 @@ def take_head(name: str) -> StateFolder | None:
             refused = refused or f"{folder}: {error.strerror or error}"
             continue
         if os.access(folder, os.W_OK):
-            _clear_beside(folder)
+            if found := _PTS.match(name):  # of pseudo terminals that had this number before: closed for good
+                for other in folder.parent.glob(f"{found.group()}*"):
+                    if other != folder:
+                        shutil.rmtree(other, ignore_errors=True)
             return StateFolder(folder, of_head=name)
     log.warning("the latch of the head at %s stays in the state folder alone: %s", name, refused)
     return None
 
 
-def other_head_folders(name: str | None, taken: StateFolder | None) -> Sequence[Path]:
-    """Return a head's folders beside the one that was taken: what is latched in those counts too."""
-    if name is None:
-        return ()
-    return [folder for folder in head_folders(name) if taken is None or folder != taken.path]
-
-
 def _heads_parents() -> list[Path]:
-    found = [SYSTEM / "heads"] if _exists(SYSTEM) else []
+    found = [SYSTEM / "heads"] if SYSTEM.is_dir() else []
     with contextlib.suppress(KeyError):  # a user whom the password database does not know
         found.append(_home() / ".local" / "state" / NAME / "heads")
     return found
 
 
-def _clear_beside(folder: Path) -> None:
-    """Remove the folders of pseudo terminals that had this one's number before: they are closed for good."""
-    found = _PTS.match(folder.name)
-    if found is not None:
-        for other in folder.parent.glob(f"{found.group()}*"):
-            if other != folder:
-                shutil.rmtree(other, ignore_errors=True)
-
-
 def _state_home() -> Path:
-    """The folder that holds the usual places of all daemons of this user."""
+    """The folder of the usual places of all daemons of this user. Raises RuntimeError without a home."""
     home = Path(os.environ.get("XDG_STATE_HOME", ""))
     return (home if home.is_absolute() else Path.home() / ".local" / "state") / NAME
 
@@ -328,21 +300,7 @@ def _digits(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()[:8]
 
 
-def _exists(folder: Path) -> bool:
-    try:
-        return folder.is_dir()
-    except OSError:  # what cannot be read may hold a latch
-        return True
-
-
 def _of_systemd() -> Path | None:
     """The folder that systemd made for the unit: the first one, if there are several."""
     first = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
     return Path(first) if first else None
-
-
-def _made(path: Path) -> None:
-    try:
-        path.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadFile(path, "", f"the state folder cannot be made: {error.strerror or error}") from None

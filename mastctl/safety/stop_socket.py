@@ -18,15 +18,12 @@ import socket
 import socketserver
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Literal
 
 from mastctl.errors import MastctlError, error_body
 from mastctl.safety.state_folder import DAEMON_FILE, DAEMON_SCHEMA, folders_of
-
-if TYPE_CHECKING:
-    from mastctl.answers import EstopAnswer, StopAnswer
 
 log = logging.getLogger(__name__)
 
@@ -37,13 +34,11 @@ SPARES = 8
 SILENT_S = 5.0
 POLL_S = 0.1  # how late the end is noticed
 ANSWER_S = 5.0
+VIA = "stop socket"
 
-
-class StopHandlers(Protocol):
-    """What the socket carries out."""
-
-    def stop_answer(self) -> StopAnswer: ...
-    def estop(self, reason: str | None, name: str | None) -> EstopAnswer: ...
+Verb = Literal["stop", "estop"]
+CarryOut = Callable[[Verb, str | None, str | None], Mapping[str, Any]]
+"""Carries a stop out, with an emergency stop's reason and name; returns the answer."""
 
 
 class StopSocket(socketserver.ThreadingUnixStreamServer):
@@ -56,9 +51,9 @@ class StopSocket(socketserver.ThreadingUnixStreamServer):
     block_on_close = False
     request_queue_size = 4096
 
-    def __init__(self, path: Path, stops: StopHandlers) -> None:
+    def __init__(self, path: Path, carry_out: CarryOut) -> None:
         self.path = path
-        self.stops = stops
+        self.carry_out = carry_out
         self._spares: list[int] = []
         if len(os.fsencode(path)) > LONGEST_PATH:
             message = f"{path} is longer than the {LONGEST_PATH} bytes that a socket's path may have"
@@ -132,17 +127,16 @@ class _Connection(socketserver.StreamRequestHandler):
                 self.wfile.write(" ".join(self._carry_out(line).split()).encode() + b"\n")
 
     def _carry_out(self, line: bytes) -> str:
-        stops: StopHandlers = self.server.stops  # type: ignore[attr-defined]
+        carry_out: CarryOut = self.server.carry_out  # type: ignore[attr-defined]
         text = line.decode("utf-8", "replace").strip()
         verb, _, rest = text.partition(" ")
+        name, colon, reason = rest.partition(":")
+        name, reason = (name, reason) if colon else ("", rest)
         try:
-            answer: StopAnswer | EstopAnswer
-            if verb == "stop" and not rest:
-                answer = stops.stop_answer()
-            elif verb == "estop":
-                name, colon, reason = rest.partition(":")
-                name, reason = (name, reason) if colon else ("", rest)
-                answer = stops.estop(reason.strip() or None, name.strip() or None)
+            if verb == "estop":
+                answer = carry_out("estop", reason.strip() or None, name.strip() or None)
+            elif text == "stop":
+                answer = carry_out("stop", None, None)
             else:
                 return f"failed: '{text[:60]}' where 'stop' or 'estop NAME: REASON' is expected"
         except Exception as error:
@@ -197,40 +191,21 @@ def request(path: Path, line: str) -> dict[str, Any]:
 
 def _answer(path: Path, line: str) -> str:
     """One line of answer; empty if the other side has closed without one."""
-    until_s = time.monotonic() + ANSWER_S
-    answer = b""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as peer:
-        peer.settimeout(ANSWER_S)
-        try:
-            _connect(peer, path, until_s)
-            peer.sendall(f"{line}\n".encode())
-            while not answer.endswith(b"\n"):
-                peer.settimeout(max(0.01, until_s - time.monotonic()))
-                part = peer.recv(4096)
-                if not part:
-                    break
-                answer += part
-        except TimeoutError:
-            raise NoAnswer(
-                f"{path} took the line but did not answer within {ANSWER_S:g} s; the head may still move"
-            ) from None
-        except (ConnectionResetError, BrokenPipeError):
-            return ""
-        except OSError as error:
-            raise NoAnswer(f"no daemon listens at {path}: {error.strerror or error}") from None
-    return answer.decode("utf-8", "replace").strip()
-
-
-def _connect(peer: socket.socket, path: Path, until_s: float) -> None:
-    """Connect, after other waiting clients. Raises OSError."""
-    while True:
-        try:
+    try:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as peer:
+            peer.settimeout(ANSWER_S)
             peer.connect(str(path))
-            return
-        except BlockingIOError:  # the kernel's queue is full; it is emptied quickly
-            if time.monotonic() > until_s:
-                raise TimeoutError from None
-            time.sleep(0.001)
+            peer.sendall(f"{line}\n".encode())
+            with peer.makefile("rb") as answer:
+                return answer.readline().decode("utf-8", "replace").strip()
+    except TimeoutError:
+        raise NoAnswer(
+            f"{path} took the line but did not answer within {ANSWER_S:g} s; the head may still move"
+        ) from None
+    except (ConnectionResetError, BrokenPipeError):
+        return ""
+    except OSError as error:
+        raise NoAnswer(f"no daemon listens at {path}: {error.strerror or error}") from None
 
 
 def _of(folder: Path) -> Iterator[tuple[Path, dict[str, Any]]]:

@@ -28,19 +28,21 @@ from drivers.simulation_clock import SimulationClock
 from mastctl.answers import (
     CalibrationAnswer,
     CameraAnswer,
+    EstopAnswer,
     KeptTarget,
     MeasuredJoints,
     PanoramaDrawn,
     ReloadResult,
     Status,
+    StopAnswer,
     TrackAnswer,
 )
 from mastctl.as_json import as_json
 from mastctl.bench.operation import BenchOperation
 from mastctl.config import Config, check_cameras, load_config
 from mastctl.control.audit import STRANGERS, STRANGERS_FILES, AuditLog
-from mastctl.control.entry import Answers, CommandEntry
-from mastctl.control.lease import LeaseTable, Steerer
+from mastctl.control.entry import ESTOP, STOP, Answers, CommandEntry, CommandRequest
+from mastctl.control.lease import Caller, LeaseTable, Steerer
 from mastctl.control.machine import StandingFault, StateMachine
 from mastctl.control.operations import Operation, OperationRunner, last_frame
 from mastctl.control.publisher import Topic
@@ -61,8 +63,8 @@ from mastctl.recorder.recorder import Recorder
 from mastctl.recorder.writer import Attached
 from mastctl.safety import stop_socket
 from mastctl.safety.latch import Latch
-from mastctl.safety.state_folder import StateFolder, other_head_folders
-from mastctl.safety.stop_socket import StopSocket
+from mastctl.safety.state_folder import StateFolder, head_folders
+from mastctl.safety.stop_socket import StopSocket, Verb
 from mastctl.service.masts import (
     MastInUse,
     Masts,
@@ -74,7 +76,7 @@ from mastctl.service.masts import (
 )
 from mastctl.service.places import places, targets
 from mastctl.service.steering import Steering
-from mastctl.service.stopping import SocketStops, Stopping, StopThreads, state_faults
+from mastctl.service.stopping import Stopping, StopThreads, state_faults
 from mastctl.service_manager import ServiceManager
 from mastctl.watch.handoffs import HandoffCheck, line_of
 from mastctl.watch.journal import JournalThread
@@ -119,8 +121,7 @@ class Service:
         self.folder = folder
         self.places, self.targets = places(self.folder.path), targets(self.folder.path)
         self.head_folder = head
-        beside = other_head_folders(head_name(config.hardware), head)
-        self.latch = Latch(folder, others=beside) if head is None else Latch(head, folder, beside)
+        self.latch = Latch(head or folder, [*head_folders(head_name(config.hardware)), folder.path])
         self.machine = StateMachine(clock, latched=self.latch.entries)
         publisher = self.machine.publisher
         self.journals = JournalThread(clock)
@@ -401,13 +402,20 @@ class Service:
 
     def open_stop_socket(self) -> None:
         """Listen for stops in the state folder, or a temporary one if its name is too long for a socket's."""
-        stops = SocketStops(self.stopping, self.entry)
         try:
-            self.stop_socket = StopSocket(self.folder.path / stop_socket.FILE, stops)
+            self.stop_socket = StopSocket(self.folder.path / stop_socket.FILE, self._stop_by_socket)
         except MastctlError as error:
             log.warning("%s", error)
             self._socket_folder = StateFolder.temporary()
-            self.stop_socket = StopSocket(self._socket_folder.path / stop_socket.FILE, stops)
+            self.stop_socket = StopSocket(self._socket_folder.path / stop_socket.FILE, self._stop_by_socket)
+
+    def _stop_by_socket(self, verb: Verb, reason: str | None, name: str | None) -> StopAnswer | EstopAnswer:
+        """Carry out a stop that came by the socket; return its answer."""
+        caller = Caller(role="view", via=stop_socket.VIA)
+        if verb == "stop":
+            return self.entry.first(STOP, CommandRequest(caller), self.stopping.stop_answer)
+        sent = CommandRequest(caller, request={"reason": reason, "name": name})
+        return self.entry.first(ESTOP, sent, lambda: self.stopping.estop(reason, name))
 
     def close(self) -> None:
         """Stop the mast and let go of everything; bounded, never raises."""

@@ -8,14 +8,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from functools import partial
 from queue import SimpleQueue
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError
 from mastctl.answers import EstopAnswer, ResetAnswer, StopAnswer
-from mastctl.control.entry import ESTOP, STOP, CommandEntry, CommandRequest
-from mastctl.control.lease import Caller
 from mastctl.control.machine import Latched, StandingFault, StateMachine, latched_sentence
 from mastctl.control.operations import STOP_REQUESTED, OperationRunner
 from mastctl.devices.devices import Devices
@@ -23,7 +22,6 @@ from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.motion.track import Tracker
 from mastctl.safety.latch import Estopped, Latch
 from mastctl.safety.state_folder import StateFolder
-from mastctl.safety.stop_socket import StopHandlers
 
 KEPT_S = 1.0  # what the disk is given before an emergency stop is answered without it
 STRAGGLER_S = 1.0  # what a reset waits for stops that follow one that was confirmed already
@@ -48,12 +46,11 @@ class StopThreads:
     """
 
     def __init__(self, threads: int = THREADS, clock: Clock | None = None) -> None:
-        self._threads = threads
         self._clock = clock or SystemClock()
-        self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
-        self._began_s: dict[object, float] = {}  # of the calls under way
+        self._calls: SimpleQueue[tuple[Callable[[], Any], Future[Any]] | None] = SimpleQueue()
+        self._began_s: list[float | None] = [None] * threads  # of the call that each is in
         for number in range(threads):
-            threading.Thread(target=self._work, name=f"stop_{number}", daemon=True).start()
+            threading.Thread(target=self._work, args=(number,), name=f"stop_{number}", daemon=True).start()
 
     def submit(self, function: Callable[[], T]) -> Future[T]:
         """Run a function in the next free thread and return its future result; returns at once.
@@ -61,39 +58,33 @@ class StopThreads:
         Raises StopsHang if every thread has been in its call for longer than a stop may take.
         """
         now_s = self._clock.now_s()
-        under_way_s = [now_s - began_s for began_s in self._began_s.copy().values()]
-        if len(under_way_s) >= self._threads and min(under_way_s) > OVERDUE_S:
+        under_way_s = [now_s - began_s for began_s in self._began_s if began_s is not None]
+        if len(under_way_s) == len(self._began_s) and min(under_way_s) > OVERDUE_S:
             raise StopsHang(
                 f"{len(under_way_s)} stops are under way, the oldest for {max(under_way_s):.1f} s, and none "
                 "has come back; the head may still move: switch its power off"
             )
         future: Future[T] = Future()
         future.set_running_or_notify_cancel()  # a caller that waits no longer does not cancel the stop
-
-        def call() -> None:
-            self._began_s[future] = self._clock.now_s()
-            result, failure = None, None
-            try:
-                result = function()
-            except BaseException as error:  # it belongs to the caller
-                failure = error
-            self._began_s.pop(future)
-            if failure is None:
-                future.set_result(result)  # type: ignore[arg-type]
-            else:
-                future.set_exception(failure)
-
-        self._calls.put(call)
+        self._calls.put((function, future))
         return future
 
     def close(self) -> None:
         """Let the threads end after what is under way; does not wait."""
-        for _ in range(self._threads):
+        for _ in self._began_s:
             self._calls.put(None)
 
-    def _work(self) -> None:
+    def _work(self, number: int) -> None:
         while (call := self._calls.get()) is not None:
-            call()
+            function, future = call
+            self._began_s[number] = self._clock.now_s()
+            end: Callable[[], None]
+            try:
+                end = partial(future.set_result, function())
+            except BaseException as error:  # it belongs to the caller
+                end = partial(future.set_exception, error)
+            self._began_s[number] = None
+            end()
 
 
 class Stopping:
@@ -115,8 +106,7 @@ class Stopping:
         self._tracker = tracker
         self._machine = machine
         self._latch = latch
-        self._blocking = threading.Lock()
-        self._block_moves()
+        devices.latched = self._refusal
 
     def stop(self, reason: str = STOP_REQUESTED) -> str | None:
         """Stop the mast, then what runs and the track; return the stopped operation's id.
@@ -156,8 +146,7 @@ class Stopping:
                 stopped = self.stop(f"an emergency stop{given}")
             except (DriverError, MastctlError) as error:
                 unconfirmed = error
-        self._latch.head_stopped()
-        kept = self._latch.kept_within(KEPT_S)
+        kept = self._latch.keep(KEPT_S)
         why = "" if kept else f"it would not survive a restart of the daemon: {self._latch.not_kept}"
         if unconfirmed is not None:
             message = f"the emergency stop is latched, but the head did not confirm it: {unconfirmed}"
@@ -179,7 +168,7 @@ class Stopping:
         """Let no move out from now on; `estop` stops the head. Returns the cause that is latched."""
         with self._operations.stopping():
             cause = self._latch.add(reason, name)
-            self._latch_changed()
+            self._machine.estop_requested(lambda: self._latch.entries)
         return cause
 
     def explain_estop(self, reason: str | None, name: str | None) -> Latched | None:
@@ -187,12 +176,8 @@ class Stopping:
         cause = self._latch.explain(reason, name) if reason or name else None
         if cause is not None:  # else there is none left to explain, after a reset for example
             with self._operations.stopping():
-                self._latch_changed()
+                self._machine.estop_requested(lambda: self._latch.entries)
         return cause
-
-    def _latch_changed(self) -> None:
-        self._machine.estop_requested(lambda: self._latch.entries)
-        self._block_moves()
 
     def reset(self, reason: str, name: str) -> ResetAnswer:
         """Release the emergency stop; nothing moves before a command comes.
@@ -209,17 +194,13 @@ class Stopping:
         if not self._devices.stops_returned(STRAGGLER_S):
             raise NotNow("stopping", "the mast is being stopped; an emergency stop is released after that")
         causes = self._latch.release(reason, name)
-        self._block_moves()
         self._machine.reset(name, reason, lambda: self._latch.entries)
         return {"latched": bool(self._latch.entries), "released": causes[0].as_json()}
 
-    def _block_moves(self) -> None:
-        """Refuse moves while anything is latched; after each change of the latch, and in turn."""
-        with self._blocking:
-            if causes := self._latch.entries:
-                self._devices.block_moves(self._latch, Estopped(latched_sentence(causes)))
-            else:
-                self._devices.allow_moves(self._latch)
+    def _refusal(self) -> Estopped | None:
+        """What refuses every move while anything is latched."""
+        causes = self._latch.entries
+        return Estopped(latched_sentence(causes)) if causes else None
 
 
 def state_faults(folder: StateFolder, latch: Latch, started_s: float) -> Iterator[StandingFault]:
@@ -228,29 +209,7 @@ def state_faults(folder: StateFolder, latch: Latch, started_s: float) -> Iterato
         above = ", an emergency stop above all" if latch.folder is folder else ", but for an emergency stop"
         message = f"nothing outlives this daemon{above}: {folder.why_temporary}"
         yield StandingFault(STATE, "state_not_kept", message, started_s, "the daemon has a state folder")
-    elif folder.refused and latch.folder is folder and not latch.entries:
-        message = f"an emergency stop would not survive a restart: {folder.refused}"
-        yield StandingFault(STATE, "state_not_kept", message, started_s, "the daemon is started again")
     elif latch.not_kept and not latch.folder.is_temporary:
-        message = f"the emergency stop is kept in memory only: {latch.not_kept}"
+        where = "is kept in memory only" if latch.entries else "would not survive a restart"
+        message = f"an emergency stop {where}: {latch.not_kept}"
         yield StandingFault(STATE, "latch_not_kept", message, latch.since_s, "the disk takes it, or a reset")
-
-
-VIA = "stop socket"
-
-
-class SocketStops:
-    """Stops that come by a daemon's socket: carried out by ``stops``, recorded by ``entry``."""
-
-    def __init__(self, stops: StopHandlers, entry: CommandEntry) -> None:
-        self._stops = stops
-        self._entry = entry
-
-    def stop_answer(self) -> StopAnswer:
-        """Stop the mast; return the answer."""
-        return self._entry.first(STOP, CommandRequest(Caller(role="view", via=VIA)), self._stops.stop_answer)
-
-    def estop(self, reason: str | None, name: str | None) -> EstopAnswer:
-        """Latch and stop; return the answer."""
-        sent = CommandRequest(Caller(role="view", via=VIA), request={"reason": reason, "name": name})
-        return self._entry.first(ESTOP, sent, lambda: self._stops.estop(reason, name))

@@ -88,12 +88,11 @@ class Watched:
         head = DeviceSettings(self.bench.driver, self.document["pan_tilt"]["options"])
         name = head_name(HardwareSettings(head, {}))
         assert name is not None
-        place = take_head(name) if state is None else StateFolder.named(state)
+        place = take_head(name) if state is None else StateFolder.of(state, state, None)
         assert place is not None
         latch = Latch(place)
         latch.add("sparks", "Ana")
-        latch.head_stopped()
-        assert latch.kept_within(60.0)
+        assert latch.keep(60.0)
         latch.close()
         place.close()
 

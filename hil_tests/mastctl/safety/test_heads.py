@@ -19,11 +19,11 @@ from drivers.serial_line import stable_name
 from hil_tests import forks
 from hil_tests.mastctl.outside_daemon import free_port, line
 from hil_tests.mastctl.safety.test_deaths import Bench, made
-from hil_tests.waiting import NET_S, present, until
+from hil_tests.waiting import NET_S, present
 from mastctl.client import Client, ClientError
 from mastctl.errors import NotNow
 from mastctl.safety import state_folder as state_folder_module
-from mastctl.safety.latch import FILE, USED, Latch
+from mastctl.safety.latch import Latch
 from mastctl.safety.state_folder import StateFolder, StateInUse, head_folders
 
 
@@ -90,44 +90,6 @@ def test_a_stop_finds_a_daemon_of_its_configuration_that_listens_elsewhere(bench
         assert present(client.status()["estop"])["name"] == "Ana"
 
 
-# A latch whose file is gone
-
-
-def used(folder: StateFolder) -> None:
-    Latch(folder).close()
-    until((folder.path / USED).exists, "the mark of a folder in use")
-
-
-def test_a_used_folder_whose_latch_file_is_gone_counts_as_latched(tmp_path: Path) -> None:
-    folder = StateFolder(tmp_path)
-    try:
-        used(folder)
-        (folder.path / FILE).unlink()
-        latch = Latch(folder)
-        assert latch.entries
-        assert "is gone" in latch.entries[0].reason
-        latch.release("looked", "Ben")
-        assert not Latch(folder).entries
-    finally:
-        folder.close()
-
-
-def test_a_head_whose_whole_folder_is_gone_is_missed_by_the_state_folder(tmp_path: Path) -> None:
-    (tmp_path / "state").mkdir()
-    (tmp_path / "head").mkdir()
-    state, head = StateFolder(tmp_path / "state"), StateFolder(tmp_path / "head")
-    try:
-        latch = Latch(head, state)
-        until((state.path / USED).exists, "the mark in the state folder")
-        latch.close()
-        for file in head.path.iterdir():
-            file.unlink()
-        assert Latch(head, state).entries
-    finally:
-        state.close()
-        head.close()
-
-
 # The log of causes
 
 
@@ -148,8 +110,7 @@ def test_a_latch_logs_its_causes_and_a_reset_releases_all(folder: StateFolder) -
     latch.add("sparks", "Ana")
     for number in range(10):
         latch.add("a stranger", f"client {number}")
-    latch.head_stopped()
-    assert latch.kept_within(NET_S)
+    assert latch.keep(NET_S)
     causes = [("Ana", "smoke"), ("Ben", "a hand in the way"), ("Ana", "sparks")]
     causes += [(f"client {number}", "a stranger") for number in range(2)]
     assert [(one.name, one.reason) for one in Latch(folder).entries] == causes
@@ -227,14 +188,13 @@ def test_a_latch_in_the_systems_or_in_the_users_place_blocks(
     with contextlib.closing(present(state_folder_module.take_head(name))) as place:
         latch = Latch(place)
         latch.add("smoke", "Ana")
-        latch.head_stopped()
-        assert latch.kept_within(NET_S)
+        assert latch.keep(NET_S)
         latch.close()
         assert place.path.is_relative_to(tmp_path / "home")
     (tmp_path / "system").mkdir()
     with contextlib.closing(present(state_folder_module.take_head(name))) as place:
         assert place.path.is_relative_to(tmp_path / "system")
-        latch = Latch(place, others=state_folder_module.other_head_folders(name, place))
+        latch = Latch(place, others=head_folders(name))
         assert latch.entries[0].name == "Ana"
         latch.release("aired", "Ben")
     shutil.rmtree(tmp_path / "system")

@@ -49,35 +49,17 @@ def latched(folder: StateFolder) -> Latch:
     """A latch with a stop that the disk holds."""
     latch = Latch(folder)
     latch.add("smoke", "Ana")
-    latch.head_stopped()
-    assert latch.kept_within(NET_S)
+    assert latch.keep(NET_S)
     return latch
 
 
 def test_a_latched_stop_is_found_by_the_next_daemon(folder: StateFolder) -> None:
     latch = Latch(folder)
     assert not latch.entries
-    held = latch.add("sparks at the\nmast", "Ana")
-    latch.head_stopped()
-    assert latch.kept_within(NET_S)
-    assert (held.reason, held.name) == ("sparks at the mast", "Ana")
-    assert Latch(folder).entries[0] == held
-
-
-def test_the_disk_waits_for_the_head_but_not_for_long(
-    folder: StateFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(latch_module, "HEAD_FIRST_S", 1e6)
-    latch = Latch(folder)
-    latch.add(None, None)
-    assert not latch.kept_within(0.05)
-    assert "not confirmed" in latch.not_kept
-    latch.head_stopped()
-    assert latch.kept_within(NET_S)
-    monkeypatch.setattr(latch_module, "HEAD_FIRST_S", 0.05)
-    latch.release("looked", "Ben")
-    latch.add(None, None)
-    assert latch.kept_within(NET_S)  # a head that hangs does not keep the disk
+    cause = latch.add("sparks at the\nmast", "Ana")
+    assert latch.keep(NET_S)
+    assert (cause.reason, cause.name) == ("sparks at the mast", "Ana")
+    assert Latch(folder).entries[0] == cause
 
 
 @pytest.mark.parametrize("data", [b"", b"\0" * 300, b'{"schema": "mastctl/latch/1"}'])
@@ -95,23 +77,22 @@ def test_a_latch_that_no_disk_takes_is_in_memory_and_a_fault(
     monkeypatch.setattr(latch_module, "AGAIN_S", 0.01)
     full = threading.Event()
     full.set()
-    true = StateFile.write
+    true = StateFile.overwrite
 
-    def write(file: StateFile, document: Any) -> None:
+    def overwrite(file: StateFile, document: Any) -> None:
         if full.is_set():
-            raise BadFile(file.path, "", "cannot be saved: No space left on device")
+            refuse(file)
         true(file, document)
 
-    monkeypatch.setattr(StateFile, "write", write)
+    monkeypatch.setattr(StateFile, "overwrite", overwrite)
     latch = Latch(folder)
-    held = latch.add("smoke", "Ana")
-    latch.head_stopped()
-    assert not latch.kept_within(NET_S)
-    assert latch.entries[0] == held
+    cause = latch.add("smoke", "Ana")
+    assert not latch.keep(NET_S)
+    assert latch.entries[0] == cause
     assert "No space left" in latch.not_kept
     full.clear()
     until(lambda: latch.not_kept == "", "the disk takes it")
-    assert Latch(folder).entries[0] == held
+    assert Latch(folder).entries[0] == cause
 
 
 def refuse(file: StateFile, *ignored: Any) -> None:
@@ -123,8 +104,8 @@ def test_a_reset_that_the_disk_refuses_releases_nothing(
 ) -> None:
     latch = latched(folder)
     with monkeypatch.context() as patch:
-        for way in ("write", "overwrite", "remove"):
-            patch.setattr(StateFile, way, refuse)
+        for method in ("write", "overwrite"):
+            patch.setattr(StateFile, method, refuse)
         for _ in range(3):
             with pytest.raises(Unable, match=r"stays latched.*No space"):
                 latch.release("aired", "Ben")
@@ -136,14 +117,14 @@ def test_a_reset_that_the_disk_refuses_releases_nothing(
 
 def test_a_stop_during_a_reset_wins(folder: StateFolder, monkeypatch: pytest.MonkeyPatch) -> None:
     latch = latched(folder)
-    true = StateFile.write
+    true = StateFile.overwrite
 
-    def write(file: StateFile, document: Any) -> None:
-        monkeypatch.setattr(StateFile, "write", true)
+    def overwrite(file: StateFile, document: Any) -> None:
+        monkeypatch.setattr(StateFile, "overwrite", true)
         true(file, document)
         latch.add("more smoke", "Cem")
 
-    monkeypatch.setattr(StateFile, "write", write)
+    monkeypatch.setattr(StateFile, "overwrite", overwrite)
     with pytest.raises(NotNow, match="another emergency stop"):
         latch.release("aired", "Ben")
     assert latch.entries
@@ -154,11 +135,11 @@ def test_a_stop_during_a_reset_wins(folder: StateFolder, monkeypatch: pytest.Mon
 def test_a_power_cut_while_a_latch_is_written_reads_as_latched(folder: StateFolder, reason: str) -> None:
     latch, path = Latch(folder), folder.path / FILE
     latch.add("sparks", "Ana")
+    assert latch.keep(NET_S)
     latch.release("\U0001f525" * 200, "Ben")
     old = path.read_bytes()
     latch.add(reason, "Cem")
-    latch.head_stopped()
-    assert latch.kept_within(NET_S)
+    assert latch.keep(NET_S)
     new = path.read_bytes()
     assert len(new) == len(old)
     parts = [slice(at, at + SECTOR_BYTES) for at in range(0, len(new), SECTOR_BYTES)]

@@ -9,7 +9,7 @@ import socket
 import stat
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,17 +26,17 @@ from mastctl.safety.stop_socket import NoAnswer, StopSocket, request
 
 
 class Stops:
-    """Counts what it is asked for."""
+    """Records the requests; ``hook`` runs first in a stop and may raise."""
 
     def __init__(self) -> None:
-        self.asked: list[tuple[Any, ...]] = []
+        self.requests: list[tuple[Any, ...]] = []
+        self.hook: Callable[[], Any] = lambda: None
 
-    def stop_answer(self) -> Any:
-        self.asked.append(("stop",))
-        return {"stopped": True, "operation": None}
-
-    def estop(self, reason: str | None, name: str | None) -> Any:
-        self.asked.append(("estop", reason, name))
+    def __call__(self, verb: str, reason: str | None, name: str | None) -> Any:
+        self.requests.append((verb, reason, name))
+        if verb == "stop":
+            self.hook()
+            return {"stopped": True, "operation": None}
         return {"stopped": True, "latched": True, "name": name}
 
 
@@ -74,9 +74,12 @@ def test_one_line_is_carried_out_and_one_line_answered(door: StopSocket, stops: 
     assert '"latched": true' in said(door.path, b"estop Ana: sparks: many\n")
     assert said(door.path, b"estop\n").startswith("estop {")
     said(door.path, b"estop smoke\r\n")
-    assert stops.asked == [
-        ("stop",), ("estop", "sparks: many", "Ana"), ("estop", None, None), ("estop", "smoke", None),
-    ]  # fmt: skip
+    assert stops.requests == [
+        ("stop", None, None),
+        ("estop", "sparks: many", "Ana"),
+        ("estop", None, None),
+        ("estop", "smoke", None),
+    ]
 
 
 def test_a_line_that_ends_with_the_senders_side_counts(door: StopSocket) -> None:
@@ -89,7 +92,7 @@ def test_a_line_that_ends_with_the_senders_side_counts(door: StopSocket) -> None
 @pytest.mark.parametrize("data", [b"\n", b"stop now\n", b"\xff\xfe\n"])
 def test_what_is_no_stop_is_told_what_is_expected(door: StopSocket, stops: Stops, data: bytes) -> None:
     assert "where 'stop' or 'estop NAME: REASON' is expected" in said(door.path, data)
-    assert stops.asked == []
+    assert stops.requests == []
 
 
 def test_a_line_without_end_is_cut_off(door: StopSocket, stops: Stops) -> None:
@@ -103,11 +106,11 @@ def test_only_its_user_may_connect(door: StopSocket) -> None:
     assert stat.S_IMODE(door.path.stat().st_mode) == 0o600
 
 
-def test_a_stop_that_fails_is_told(door: StopSocket, stops: Stops, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_that_fails_says_why(door: StopSocket, stops: Stops) -> None:
     def refuse() -> Any:
         raise DriverError("the cable is cut")
 
-    monkeypatch.setattr(stops, "stop_answer", refuse)
+    stops.hook = refuse
     assert said(door.path, b"stop\n") == "failed: the cable is cut\n"
     with pytest.raises(ValueError, match="the cable is cut"):
         request(door.path, "stop")
@@ -117,7 +120,7 @@ def test_a_stop_that_hangs_keeps_no_other_out(
     door: StopSocket, stops: Stops, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hang = Hang()
-    monkeypatch.setattr(stops, "stop_answer", hang)
+    stops.hook = hang
     monkeypatch.setattr(stop_socket_module, "ANSWER_S", 0.1)
     with pytest.raises(NoAnswer, match="may still move"):
         request(door.path, "stop")
@@ -220,9 +223,9 @@ def test_the_commands_work_with_a_broken_configuration(
             door = StopSocket(folder.path / "stop.sock", stops)
             stack.callback(door.close)
             folder.note_daemon(path, "http://127.0.0.1:8420", door.path)
-            asked.append(stops.asked)
+            asked.append(stops.requests)
         assert main(["stop", "--config", str(config)]) == 0
-        assert asked == [[("stop",)], []]
+        assert asked == [[("stop", None, None)], []]
         assert main(["estop", "--config", str(config)]) == 0
         assert [len(one) for one in asked] == [2, 0]
 
