@@ -22,7 +22,7 @@ from mastctl.calibration.landing import expected_pointing
 from mastctl.calibration.mast_file import fit_document, picked, with_fit
 from mastctl.calibration.run import checked_survey, conclude
 from mastctl.calibration.verdict import CalibrationVerdict, judge
-from mastctl.report.tables import Table
+from mastctl.report.pages import Table
 
 HALF = 0.5
 

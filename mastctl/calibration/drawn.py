@@ -15,7 +15,7 @@ from calib.geometry.rigid import FloatArray, Rigid
 from calib.plan.knowledge import ExpectedPointing
 from calib.survey.records import Survey
 from calib.targets.boards import Board
-from mastctl.report import plots
+from mastctl.report import pictures
 
 CELLS = (16, 12)
 """Of an image in which corners are counted."""
@@ -25,8 +25,8 @@ ARROW_PART = 0.025
 
 MANY_DOTS = 2500
 
-SIDES = ((1, plots.BLUE, "came from smaller angles"), (-1, plots.RUST, "came from larger angles"),
-         (0, plots.GREY, "came from either side"))  # fmt: skip
+SIDES = ((1, pictures.BLUE, "came from smaller angles"), (-1, pictures.RUST, "came from larger angles"),
+         (0, pictures.GREY, "came from either side"))  # fmt: skip
 
 
 def cells_seen(fit: FittedRig, camera: str) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -57,7 +57,7 @@ def residuals(fit: FittedRig, cameras: Sequence[str]) -> Any:
     figure, axes = _image_of_each(fit.rig, cameras)
     for axis, name in zip(axes, cameras, strict=True):
         width = fit.rig.cameras[name].model.size_px[0]
-        for check, colour, label in ((False, plots.BLUE, "fitted"), (True, plots.RUST, "not fitted")):
+        for check, colour, label in ((False, pictures.BLUE, "fitted"), (True, pictures.RUST, "not fitted")):
             places, arrows = _dots(_of_camera(fit, name, check))
             if not check:
                 scale = _arrow_scale(arrows, width)
@@ -69,7 +69,7 @@ def residuals(fit: FittedRig, cameras: Sequence[str]) -> Any:
                 )  # fmt: skip
         out = [image.pixels_px[~image.used] for image in _of_camera(fit, name)]
         if out and len(left_out := np.concatenate(out)):
-            axis.scatter(*left_out.T, marker="x", s=14, color=plots.GREY, label="left out")
+            axis.scatter(*left_out.T, marker="x", s=14, color=pictures.GREY, label="left out")
         rms = fit.rms_px.get(name, (float("nan"),) * 2)
         axis.set_title(f"{name}: rms {rms[0]:.3f}, {rms[1]:.3f} px", fontsize=10)
         axis.set_xlabel(f"x, px; arrows drawn {1 / scale:.0f} times as long")
@@ -80,7 +80,7 @@ def residuals(fit: FittedRig, cameras: Sequence[str]) -> Any:
 def over_images(fit: FittedRig, cameras: Sequence[str]) -> Any:
     """Draw each image's mean residual over the joint that moves it (pan in x, tilt in y), and its rms over
     the board's range and its angle to the line of sight."""
-    figure = plots.new(11.5, 5.8)
+    figure = pictures.new_plot(11.5, 5.8)
     panels: Sequence[tuple[str, str, Callable[[ImageResiduals], tuple[float | None, float, float]]]] = (
         ("pan read, deg", "mean residual in x, px", lambda i: (_degrees(i.pan_rad), *_mean(i, 0))),
         ("tilt read, deg", "mean residual in y, px", lambda i: (_degrees(i.tilt_rad), *_mean(i, 1))),
@@ -96,7 +96,7 @@ def over_images(fit: FittedRig, cameras: Sequence[str]) -> Any:
                 if len(known):
                     axis.errorbar(
                         *known.T, fmt="^" if check else "o", ms=4, lw=0.8, alpha=0.75,
-                        color=plots.COLOURS[index % len(plots.COLOURS)],
+                        color=pictures.COLOURS[index % len(pictures.COLOURS)],
                         label=f"{name}{', not fitted' if check else ''}",
                     )  # fmt: skip
         axis.set(xlabel=across, ylabel=up)
@@ -107,7 +107,7 @@ def over_images(fit: FittedRig, cameras: Sequence[str]) -> Any:
 
 def joint_curves(fit: BenchCalibration, survey: Survey) -> Any:
     """Draw what each joint's reading is wrong by: the fitted curve, its 95 % band, what each image says."""
-    figure = plots.new(11.5, 4.2)
+    figure = pictures.new_plot(11.5, 4.2)
     known = RigCovariance(fit.parameter_names, fit.covariance)
     for axis, joint in zip(figure.subplots(1, 2), ("pan", "tilt"), strict=True):
         model: AxisJoint = getattr(fit.rig.joints, joint)
@@ -162,7 +162,7 @@ def workspace(aim: ExpectedPointing, covariance: FloatArray, fit: FittedRig) -> 
     places = np.array(aim.places)
     taken = sorted({(i.pan_rad, i.tilt_rad) for i in fit.images if i.pan_rad is not None})
     ranges = np.unique(places[:, 2]).tolist()
-    figure = plots.new(3.9 * len(ranges), 3.6)
+    figure = pictures.new_plot(3.9 * len(ranges), 3.6)
     axes = np.atleast_1d(figure.subplots(1, len(ranges), sharey=True))
     pans, tilts = np.unique(places[:, 0]), np.unique(places[:, 1])
     maps = np.full((len(ranges), len(tilts), len(pans)), np.nan)
@@ -186,7 +186,7 @@ def workspace(aim: ExpectedPointing, covariance: FloatArray, fit: FittedRig) -> 
 
 def boards(fit: Calibration, board: Board) -> Any:
     """Draw every board and camera in the rover frame, from above and from the side."""
-    figure = plots.new(10.5, 5.2)
+    figure = pictures.new_plot(10.5, 5.2)
     plan, side = figure.subplots(1, 2)
     corners = board.dots_in_board_m(
         [0, 0, board.rows - 1, board.rows - 1, 0], [0, board.columns - 1, board.columns - 1, 0, 0]
@@ -194,7 +194,7 @@ def boards(fit: Calibration, board: Board) -> Any:
     purposes: dict[tuple[str, str], str] = {}
     for image in fit.images:
         purposes.setdefault((image.setup, image.placement), image.purpose)
-    colour_of = {"camera": plots.BLUE, "mast": plots.GREEN, "check": plots.RUST}
+    colour_of = {"camera": pictures.BLUE, "mast": pictures.GREEN, "check": pictures.RUST}
     views = ((plan, (1, 0)), (side, (0, 2)))
     labels = {purpose: f"boards: {purpose}" for purpose in colour_of}
     for key, pose in fit.rover_from_board.items():
@@ -220,7 +220,7 @@ def boards(fit: Calibration, board: Board) -> Any:
 
 def _image_of_each(rig: Rig, cameras: Sequence[str]) -> tuple[Any, Any]:
     """A figure with an axes of each camera's image, y downwards."""
-    figure = plots.new(5.6 * len(cameras), 4.4)
+    figure = pictures.new_plot(5.6 * len(cameras), 4.4)
     axes = np.atleast_1d(figure.subplots(1, len(cameras)))
     for axis, name in zip(axes, cameras, strict=True):
         width, height = rig.cameras[name].model.size_px

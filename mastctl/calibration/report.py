@@ -18,9 +18,9 @@ from mastctl.calibration import drawn
 from mastctl.calibration.landing import expected_pointing, pointing_change, rig_differences
 from mastctl.calibration.sigmas import finding_table, sigma_table
 from mastctl.calibration.verdict import CalibrationVerdict
-from mastctl.report import pages, plots
+from mastctl.report import pages, pictures
+from mastctl.report.pages import Table, number, x_y
 from mastctl.report.pictures import Figure
-from mastctl.report.tables import Table, number, x_y
 
 AnyFit = Calibration | BenchCalibration
 
@@ -73,7 +73,7 @@ def write_report(
         notes=fit.notes,
         held_fixed=fit.gauges if isinstance(fit, BenchCalibration) else HELD_FIXED,
         left_out=[outlier.sentence for outlier in fit.outliers],
-        plots=list(_plots(survey, fit)) if plots.installed() else None,
+        plots=list(_plots(survey, fit)) if pictures.can_plot() else None,
         changes=[] if former is None else list(_changes(fit.rig, former)),
         worst_images=_worst_images(fit),
         **parts,
@@ -128,7 +128,7 @@ def camera_table(fit: FittedRig, promised_px: Mapping[str, float] | None = None)
 def _plots(survey: Survey, fit: AnyFit) -> Iterable[tuple[str, Figure]]:
     """Every plot, with its heading."""
     for heading, figure, alt, caption in _drawn(survey, fit):
-        yield heading, plots.plot(figure, alt, caption, "map" if alt.startswith("maps") else "lines")
+        yield heading, pictures.plot(figure, alt, caption, "map" if alt.startswith("maps") else "lines")
 
 
 def _drawn(survey: Survey, fit: AnyFit) -> Iterable[tuple[str, Any, str, str]]:

@@ -11,7 +11,7 @@ from calib.adjust.hypotheses import Finding
 from calib.adjust.result import FittedRig, ImageResiduals
 from calib.adjust.terms import DOTS_OF, DRAWING, JOINTS
 from calib.survey.records import Survey
-from mastctl.report.tables import Table
+from mastctl.report.pages import Table
 
 OWN = "their own sigmas"
 """What states a sigma that dots or corners came with, each its own; shown is the median."""

@@ -160,11 +160,11 @@ def _print_table(shown: Shown) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from mastctl.report import tables
+    from mastctl.report import pages
 
     rows = list(shown.rows)
     table = Table(title=Text(shown.title), title_justify="left", show_header=any(shown.columns))
-    for column, numeric in zip(shown.columns, tables.Table(shown.columns, rows).numeric, strict=True):
+    for column, numeric in zip(shown.columns, pages.Table(shown.columns, rows).numeric, strict=True):
         table.add_column(Text(column), justify="right" if numeric else "left", overflow="fold")
     for row in rows:
         table.add_row(*(Text(one) for one in row))

@@ -7,10 +7,10 @@ fails is a row of its own with the reason; it never leaves the record.
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from math import nan
 from typing import Any
 
 import numpy as np
@@ -21,22 +21,36 @@ from drivers.interfaces import Image
 from mastctl.client import Client, ClientError
 from mastctl.experiment.targets import VIEWS_PER_TARGET, Target, TargetViews, pointed
 
-# Rms pixel errors (x, y) of the paper's Table VI: first and second pointing at each distance in metres.
-PAPER_TABLE_VI: Mapping[float, tuple[tuple[float, float], tuple[float, float]]] = {
+XY = tuple[float, float]
+
+PAPER_TABLE_VI: Mapping[float, tuple[XY, XY]] = {
     10.0: ((0.591, 1.219), (0.527, 0.778)),
     6.0: ((0.743, 1.243), (0.596, 0.844)),
     2.0: ((1.260, 0.925), (0.672, 0.921)),
 }
+"""Rms pixel errors (x, y) of the paper: first and second pointing at each distance in metres."""
+
+ENDING = ("stopped", "estopped", "leased")
+"""Another client has stopped the mast or steers it: no further target moves the head."""
+
+PAN_RANGE_RAD = 1.0
+"""Targets lie this far to either side of straight ahead: the pan range of the paper's calibration (III.C)."""
+
+ClickTruth = Callable[[str, XY, str, XY], XY | None]
+"""What only a simulation knows: the true residual (x, y) in pixels of a click, None if it hit the sky.
+
+Called with the clicked frame's id and pixel, the later frame's id, and the pixel that was aimed at in it.
+"""
 
 
 @dataclass(frozen=True)
 class Landing:
     """One pointing of a target: the measured residual, its sigma, the true one where it is known."""
 
-    residual_px: tuple[float, float]
-    sigma_px: tuple[float, float]
+    residual_px: XY
+    sigma_px: XY
     frame_id: str
-    true_px: tuple[float, float] | None = None
+    true_px: XY | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +60,12 @@ class TargetRecord:
     distance_m: float
     index: int
     camera: str
-    frame_id: str
-    clicked_px: tuple[float, float]
-    range_m: float
-    pan_before_rad: float
-    tilt_before_rad: float
-    landings: tuple[Landing, ...]
+    frame_id: str = ""
+    clicked_px: XY = (nan, nan)
+    range_m: float = nan
+    pan_before_rad: float = nan
+    tilt_before_rad: float = nan
+    landings: tuple[Landing, ...] = ()
     error: str = ""
     seconds: float = 0.0
     operation: Mapping[str, Any] = field(default_factory=dict)
@@ -66,38 +80,59 @@ class DistanceSummary:
     distance_m: float
     targets: int
     failed: int
-    first_rms_px: tuple[float, float] | None
-    second_rms_px: tuple[float, float] | None
-    true_first_rms_px: tuple[float, float] | None
-    true_second_rms_px: tuple[float, float] | None
-    worst_first_px: float | None
+    first_rms_px: XY | None
+    second_rms_px: XY | None
+    true_first_rms_px: XY | None
+    true_second_rms_px: XY | None
     seconds: float
+
+    @classmethod
+    def of(cls, distance_m: float, rows: Sequence[TargetRecord]) -> DistanceSummary:
+        """Return the row of a distance's records; failed targets are counted, not averaged."""
+        landings = [[row.landings[k] for row in rows if len(row.landings) > k] for k in range(2)]
+        first, second = (rms([one.residual_px for one in each]) for each in landings)
+        true_1, true_2 = (rms([one.true_px for one in each if one.true_px]) for each in landings)
+        failed, seconds = sum(bool(row.error) for row in rows), sum(row.seconds for row in rows)
+        return cls(distance_m, len(rows), failed, first, second, true_1, true_2, round(seconds, 2))
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it for programs, beside the paper's where it has this distance."""
+        known = self.true_first_rms_px is not None
+        document = {key: one for key, one in vars(self).items() if known or not key.startswith("true_")}
+        paper = zip(("first", "second"), PAPER_TABLE_VI.get(self.distance_m, ()), strict=False)
+        return document | {f"paper_{which}_rms_px": rms_px for which, rms_px in paper}
 
 
 @dataclass(frozen=True, eq=False)
 class PointingExperiment:
-    """What was run and what came out."""
+    """What was run and what came out; ``seconds`` by the rover's clock."""
 
-    url: str
     status: Mapping[str, Any]
     seed: int
     camera: str
-    aim_px: tuple[float, float]
+    aim_px: XY
     records: tuple[TargetRecord, ...]
-    summaries: tuple[DistanceSummary, ...]
     started: str
     seconds: float
     notes: tuple[str, ...] = ()
 
+    @property
+    def summaries(self) -> list[DistanceSummary]:
+        """A row for each distance."""
+        distances_m = dict.fromkeys(record.distance_m for record in self.records)
+        return [
+            DistanceSummary.of(one, [record for record in self.records if record.distance_m == one])
+            for one in distances_m
+        ]
+
     def as_json(self) -> dict[str, Any]:
         """Return the document that ``--json`` prints."""
         return {
-            "url": self.url,
             "hardware": self.status.get("hardware"),
             "camera": self.camera,
             "seed": self.seed,
             "seconds": round(self.seconds, 2),
-            "distances": [_row_as_json(row) for row in self.summaries],
+            "distances": [row.as_json() for row in self.summaries],
             "notes": list(self.notes),
             "failures": [
                 {"distance_m": r.distance_m, "target": r.index, "error": r.error}
@@ -107,56 +142,12 @@ class PointingExperiment:
         }
 
 
-def _row_as_json(row: DistanceSummary) -> dict[str, Any]:
-    """One distance for programs."""
-    document = {
-        key: value
-        for key, value in vars(row).items()
-        if row.true_first_rms_px is not None or not key.startswith("true_")
-    } | {"seconds": round(row.seconds, 2)}
-    paper = PAPER_TABLE_VI.get(row.distance_m)
-    if paper is not None:
-        document["paper_first_rms_px"], document["paper_second_rms_px"] = paper
-    return document
-
-
-def summarise_distance(distance_m: float, rows: Sequence[TargetRecord], seconds: float) -> DistanceSummary:
-    """Return the table's row for the records of one distance; failed targets are counted, not averaged."""
-    first, second = ([row.landings[k] for row in rows if len(row.landings) > k] for k in range(2))
-    true = [[one.true_px for one in landings if one.true_px is not None] for landings in (first, second)]
-    return DistanceSummary(
-        distance_m,
-        len(rows),
-        sum(bool(row.error) for row in rows),
-        rms([one.residual_px for one in first]),
-        rms([one.residual_px for one in second]),
-        rms(true[0]),
-        rms(true[1]),
-        max((math.hypot(*one.residual_px) for one in first), default=None),
-        seconds,
-    )
-
-
-def rms(pairs: Sequence[tuple[float, float]]) -> tuple[float, float] | None:
+def rms(pairs: Sequence[XY]) -> XY | None:
     """Return the root mean square of each column about zero, or None of nothing."""
     if not pairs:
         return None
     x, y = np.sqrt(np.mean(np.square(np.array(pairs, dtype=float)), axis=0))
     return float(x), float(y)
-
-
-ENDING = ("stopped", "estopped", "leased")
-"""Another client has stopped the mast or steers it: no further target moves the head."""
-
-# Targets lie this far to either side of straight ahead: the pan range of the paper's calibration (III.C).
-PAN_RANGE_RAD = 1.0
-
-
-ClickTruth = Callable[[str, tuple[float, float], str, tuple[float, float]], tuple[float, float] | None]
-"""What only a simulation knows: the true residual (x, y) in pixels of a click, None if it hit the sky.
-
-Called with the clicked frame's id and pixel, the later frame's id, and the pixel that was aimed at in it.
-"""
 
 
 def run_pointing_experiment(
@@ -176,55 +167,39 @@ def run_pointing_experiment(
     There are so many ``targets`` at each distance from the camera to the ground, from number ``first`` on,
     each with a draw of its own by ``seed``. ``on_target`` is called after each, failed or not. Of each
     distance ``pictures`` targets keep their images for the report; ``notes`` are for its reader. A stop by
-    another client, or its lease, ends the experiment: the record has what was measured before. Raises
-    ClientError if the daemon cannot be reached or refuses for another reason than the target itself.
+    another client, its lease, or a fault for which a target fails ends the experiment: the record has what
+    was measured before, and a note why. Raises ClientError if the daemon cannot be reached.
     """
     status = client.status()
-    begun_s, started, url = status["now_s"], time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), client.url
-    if _on_demand(client):  # the record of such a run is to be the same every time
-        started, url = f"{begun_s:.3f} s of the simulated rover's own time", "a simulated rover"
     rig = parse_rig(client.mast_file(), "the daemon's mast file").rig
-    pair = head_pair(rig, set(status["cameras"]))
-    aim_px = rig.cameras[pair[0]].model.image_center_px
-    run = _PointingRun(client, rig, pair, status["limits"], seed, truth)
+    run = _PointingRun(client, rig, head_pair(rig, set(status["cameras"])), status["limits"], seed, truth)
+    started = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     records: list[TargetRecord] = []
-    summaries = []
     ended = ""
     for distance_m in distances_m:
-        if ended:
-            break
-        distance_begun_s = _now_s(client)
-        rows: list[TargetRecord] = []
+        shown = 0
         for index in range(first, first + targets):
-            wanted = sum(bool(row.landed_images) for row in rows) < pictures
+            place = f"target {index} at {distance_m:g} m"
             try:
-                record = run.one_target(distance_m, index, wanted)
+                record = run.one_target(distance_m, index, shown < pictures)
             except ClientError as error:
                 if error.code not in ENDING:
                     raise
-                ended = f"ended before target {index} at {distance_m:g} m: {error}"
+                ended = f"ended before {place}: {error}"
                 break
-            rows.append(record)
+            shown += bool(record.landed_images)
+            records.append(record)
             if on_target is not None:
                 on_target(record)
-        records += rows
-        summaries.append(summarise_distance(distance_m, rows, _now_s(client) - distance_begun_s))
+            if record.error and (fault := run.fault()):
+                ended = f"ended after {place}: {fault}"
+                break
+        if ended:
+            break
     return PointingExperiment(
-        url, status, seed, pair[0], aim_px, tuple(records), tuple(summaries), started,
-        _now_s(client) - begun_s, (*notes, ended) if ended else tuple(notes),
+        status, seed, run.pair[0], run.aim_px, tuple(records), started,
+        run.now_s() - status["now_s"], (*notes, *filter(None, [ended])),
     )  # fmt: skip
-
-
-def _now_s(client: Client) -> float:
-    return float(client.status()["now_s"])
-
-
-def _on_demand(client: Client) -> bool:
-    """Whether the daemon is a simulated rover whose time passes only on demand (``speed: max``)."""
-    try:
-        return bool(client.simulation_time()["speed"] == "max")
-    except ClientError:  # anything else than this program's own simulated rover
-        return False
 
 
 def head_pair(rig: Rig, served: set[str]) -> tuple[str, str]:
@@ -255,70 +230,73 @@ class _PointingRun:
     seed: int
     truth: ClickTruth | None
 
+    @property
+    def aim_px(self) -> XY:
+        """The middle of the left image."""
+        return self.rig.cameras[self.pair[0]].model.image_center_px
+
+    def now_s(self) -> float:
+        """Return the rover's clock."""
+        return float(self.client.status()["now_s"])
+
+    def fault(self) -> str:
+        """Return the first fault of the head or the pair's cameras as a sentence; empty without one."""
+        for one in self.client.status()["faults"]:
+            if one["device"] not in self.rig.cameras or one["device"] in self.pair:
+                return f"{one['device']} has a fault until {one['until']}: {one['message']}"
+        return ""
+
     def one_target(self, distance_m: float, index: int, with_pictures: bool) -> TargetRecord:
-        """Find one target at the distance, point at it twice, and return the record of it."""
-        begun_s = _now_s(self.client)
+        """Find one target at the distance, point at it twice, and return the record of it.
+
+        Raises ClientError if another client ends the experiment.
+        """
+        begun_s = self.now_s()
+        record = TargetRecord(distance_m, index, self.pair[0])
         rng = np.random.default_rng([self.seed, round(1000 * distance_m), index])
         views = TargetViews(self.client, self.rig, self.pair, self.limits, rng, PAN_RANGE_RAD)
-        reason = f"no textured target found at {distance_m:g} m in {VIEWS_PER_TARGET} views"
-        target = None
         try:
-            for _ in range(VIEWS_PER_TARGET):
-                target = target or views.find_target(distance_m)
-        except ClientError as error:
-            if error.code in ENDING:
-                raise
-            reason = f"searching a target: {error}"
-        if target is not None:
-            return self._point_at(target, distance_m, index, begun_s, with_pictures)
-        nan = math.nan
-        return TargetRecord(
-            distance_m, index, self.pair[0], "", (nan, nan), nan, nan, nan, (), reason,
-            _now_s(self.client) - begun_s,
-        )  # fmt: skip
-
-    def _point_at(
-        self, target: Target, distance_m: float, index: int, begun_s: float, with_pictures: bool
-    ) -> TargetRecord:
-        """Request two pointings and record what the daemon measured."""
-        error, operation = "", None
-        try:
-            pixel = (target.shot.camera, target.shot.frame_id, target.x_px, target.y_px)
-            operation = pointed(self.client, pixel=pixel, pointings=2)
-            if operation["state"] != "done":
-                if operation["state"] in ENDING:
-                    raise ClientError(operation["state"], "the pointing was stopped")
-                reason = operation["error"] or {"code": operation["state"], "message": "stopped"}
-                error = f"{reason['code']}: {reason['message']}"
+            found = (views.find_target(distance_m) for _ in range(VIEWS_PER_TARGET))
+            target = next((one for one in found if one is not None), None)
+            if target is None:
+                reason = f"no textured target found at {distance_m:g} m in {VIEWS_PER_TARGET} views"
+                record = replace(record, error=reason)
+            else:
+                record = _chosen(record, target)
+                pixel = (record.camera, record.frame_id, *record.clicked_px)
+                record = self._landed(record, pointed(self.client, pixel=pixel, pointings=2))
+                if with_pictures:
+                    shots = [
+                        self.client.snapshot(record.camera, frame_id=o.frame_id) for o in record.landings
+                    ]
+                    images = tuple(shot.image for shot in shots)
+                    record = replace(record, clicked_image=target.shot.image, landed_images=images)
         except ClientError as refusal:
             if refusal.code in ENDING:
                 raise
-            error = f"{refusal.code}: {refusal}"
-        entries = operation["pointings"] if operation is not None else []
-        landings = tuple(self._landing(target, entry) for entry in entries)
-        images = [one.frame_id for one in landings] if with_pictures else []
-        return TargetRecord(
-            distance_m=distance_m,
-            index=index,
-            camera=target.shot.camera,
-            frame_id=target.shot.frame_id,
-            clicked_px=(target.x_px, target.y_px),
-            range_m=target.range_m,
-            pan_before_rad=target.shot.pan_rad,
-            tilt_before_rad=target.shot.tilt_rad,
-            landings=landings,
-            error=error,
-            seconds=_now_s(self.client) - begun_s,
-            operation=operation or {},
-            clicked_image=target.shot.image if with_pictures else None,
-            landed_images=tuple(
-                self.client.snapshot(target.shot.camera, frame_id=one).image for one in images
-            ),
-        )
+            record = replace(record, error=f"{refusal.code}: {refusal}")
+        return replace(record, seconds=self.now_s() - begun_s)
 
-    def _landing(self, target: Target, entry: Mapping[str, Any]) -> Landing:
-        """One entry of the operation's ``pointings``, with the true residual where it is known."""
-        aim_px = self.rig.cameras[self.pair[0]].model.image_center_px
-        frame_id, clicked_px = str(entry["frame_id"]), (target.x_px, target.y_px)
-        true_px = self.truth and self.truth(target.shot.frame_id, clicked_px, frame_id, aim_px)
-        return Landing(tuple(entry["residual_px"]), tuple(entry["residual_sigma_px"]), frame_id, true_px)
+    def _landed(self, record: TargetRecord, operation: Mapping[str, Any]) -> TargetRecord:
+        """The record with what the daemon measured. Raises ClientError after a stop."""
+        if operation["state"] in ENDING:
+            raise ClientError(operation["state"], "the pointing was stopped")
+        landings = []
+        for one in operation["pointings"]:
+            frame_id = str(one["frame_id"])
+            true_px = self.truth and self.truth(record.frame_id, record.clicked_px, frame_id, self.aim_px)
+            residual_px, sigma_px = tuple(one["residual_px"]), tuple(one["residual_sigma_px"])
+            landings.append(Landing(residual_px, sigma_px, frame_id, true_px))
+        error = ""
+        if operation["state"] != "done":
+            reason = operation["error"] or {"code": operation["state"], "message": "stopped"}
+            error = f"{reason['code']}: {reason['message']}"
+        return replace(record, landings=tuple(landings), error=error, operation=operation)
+
+
+def _chosen(record: TargetRecord, target: Target) -> TargetRecord:
+    shot, clicked_px = target.shot, (target.x_px, target.y_px)
+    return replace(
+        record, frame_id=shot.frame_id, clicked_px=clicked_px, range_m=target.range_m,
+        pan_before_rad=shot.pan_rad, tilt_before_rad=shot.tilt_rad,
+    )  # fmt: skip

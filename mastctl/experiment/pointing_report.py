@@ -2,36 +2,33 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 
-from mastctl.experiment.pointing import (
-    PAPER_TABLE_VI,
-    DistanceSummary,
-    PointingExperiment,
-    TargetRecord,
-)
-from mastctl.report import pages, pictures, plots
-from mastctl.report.pages import write_csv, write_json
+from mastctl.experiment.pointing import PAPER_TABLE_VI, DistanceSummary, PointingExperiment, TargetRecord
+from mastctl.report import pages, pictures
+from mastctl.report.pages import Table, number, x_y
 from mastctl.report.pictures import Figure
-from mastctl.report.tables import Table, number, x_y
 
 PICTURES_PER_DISTANCE = 4
 LEAST_REACH_PX = 0.1  # of the scatter's axes
 CROP_PX, CROP_SCALE = 60, 4  # half the side of the piece of image shown around the aim, and how much larger
 
-CSV_COLUMNS = (
+COLUMNS = (
     "distance_m", "target", "camera", "frame_id", "clicked_x_px", "clicked_y_px", "range_m",
     "pan_before_rad", "tilt_before_rad",
-    "first_x_px", "first_y_px", "first_sigma_x_px", "first_sigma_y_px",
-    "first_true_x_px", "first_true_y_px", "first_frame_id",
-    "second_x_px", "second_y_px", "second_sigma_x_px", "second_sigma_y_px",
-    "second_true_x_px", "second_true_y_px", "second_frame_id",
+    *(
+        f"{which}_{part}"
+        for which in ("first", "second")
+        for part in ("x_px", "y_px", "sigma_x_px", "sigma_y_px", "true_x_px", "true_y_px", "frame_id")
+    ),
     "seconds", "error",
 )  # fmt: skip
 
@@ -42,13 +39,16 @@ def write_pointing_report(experiment: PointingExperiment, folder: Path) -> Path:
     Raises OSError if the folder or a file in it cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    write_csv(folder / "targets.csv", CSV_COLUMNS, [_csv_row(record) for record in experiment.records])
+    with (folder / "targets.csv").open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(map(_csv_row, experiment.records))
     targets = [
-        {"distance_m": r.distance_m, "target": r.index, "error": r.error, "operation": dict(r.operation)}
+        {"distance_m": r.distance_m, "target": r.index, "error": r.error, "operation": r.operation}
         for r in experiment.records
     ]
-    record = experiment.as_json() | {"status": dict(experiment.status), "targets": targets}
-    write_json(folder / "record.json", record)
+    record = experiment.as_json() | {"status": experiment.status, "targets": targets}
+    (folder / "record.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
     page = folder / "report.html"
     page.write_text(_page(experiment), encoding="utf-8", errors="backslashreplace")
     return page
@@ -74,43 +74,45 @@ def pointing_table(summaries: Sequence[DistanceSummary]) -> Table:
     return Table(headings, rows)
 
 
-def _csv_row(record: TargetRecord) -> list[Any]:
-    """One target as a row of targets.csv; empty cells for what does not exist."""
-    cells: list[Any] = [
-        record.distance_m, record.index, record.camera, record.frame_id, *record.clicked_px, record.range_m,
-        record.pan_before_rad, record.tilt_before_rad,
-    ]  # fmt: skip
-    for which in range(2):
-        if which < len(record.landings):
-            landing = record.landings[which]
-            true = landing.true_px or ("", "")
-            cells += [*landing.residual_px, *landing.sigma_px, *true, landing.frame_id]
-        else:
-            cells += [""] * 7
-    return [*cells, round(record.seconds, 3), record.error]
+def _csv_row(record: TargetRecord) -> Mapping[str, Any]:
+    """One target as a row of targets.csv, without what does not exist."""
+    row: dict[str, Any] = {
+        "distance_m": record.distance_m, "target": record.index, "camera": record.camera,
+        "frame_id": record.frame_id, "clicked_x_px": record.clicked_px[0],
+        "clicked_y_px": record.clicked_px[1], "range_m": record.range_m,
+        "pan_before_rad": record.pan_before_rad, "tilt_before_rad": record.tilt_before_rad,
+        "seconds": round(record.seconds, 3), "error": record.error,
+    }  # fmt: skip
+    for which, landing in zip(("first", "second"), record.landings, strict=False):
+        row[f"{which}_frame_id"] = landing.frame_id
+        pairs = ("", landing.residual_px), ("sigma_", landing.sigma_px), ("true_", landing.true_px)
+        for kind, pair in pairs:
+            row |= {f"{which}_{kind}{axis}_px": one for axis, one in zip("xy", pair or (), strict=False)}
+    return {key: one for key, one in row.items() if not (isinstance(one, float) and math.isnan(one))}
 
 
 def _page(experiment: PointingExperiment) -> str:
-    badge, facts = pages.of_daemon(experiment.status)
-    facts += [
-        ("camera", experiment.camera),
-        ("seed", str(experiment.seed)),
-        ("started", experiment.started),
-        ("took", f"{experiment.seconds:.0f} s"),
-    ]
-    failures = [[f"{r.distance_m:g} m", str(r.index), r.error] for r in experiment.records if r.error]
+    status = experiment.status
+    kind = str(status.get("hardware", "unknown"))
+    mast = status.get("mast") or {}
     landed = any(record.landings for record in experiment.records)
     return pages.page(
         "pointing.html",
         title="Pointing experiment",
-        badge=badge,
-        facts=facts,
+        badge=pages.Badge(kind.upper(), kind),
+        facts=[
+            ("hardware", kind),
+            ("mast file", f"{mast.get('file', '')} ({str(mast.get('digest', ''))[:12]})"),
+            ("camera", experiment.camera),
+            ("seed", str(experiment.seed)),
+            ("started", experiment.started),
+            ("took", f"{experiment.seconds:.0f} s"),
+        ],
         residuals=pointing_table(experiment.summaries),
         aim=f"{experiment.aim_px[0]:g}, {experiment.aim_px[1]:g}",
         notes=experiment.notes,
-        failures=Table(("distance", "target", "reason"), failures),
         landed=landed,
-        scatter=_scatter(experiment) if landed and plots.installed() else None,
+        scatter=_scatter(experiment) if landed and pictures.can_plot() else None,
         views=_views(experiment),
         targets=_targets(experiment.records),
     )
@@ -140,11 +142,11 @@ def _scatter(experiment: PointingExperiment) -> Figure:
     landings = [landing for record in experiment.records for landing in record.landings]
     reach = max(LEAST_REACH_PX, 1.1 * max(max(abs(v) for v in landing.residual_px) for landing in landings))
     count = len(experiment.summaries)
-    figure = plots.new(4.2 * count, 4.4)
+    figure = pictures.new_plot(4.2 * count, 4.4)
     for axis, summary in zip(figure.subplots(1, count, squeeze=False)[0], experiment.summaries, strict=True):
         rows = [record for record in experiment.records if record.distance_m == summary.distance_m]
         for which, (label, colour, marker) in enumerate(
-            (("first pointing", plots.RUST, "o"), ("second pointing", plots.BLUE, "^"))
+            (("first pointing", pictures.RUST, "o"), ("second pointing", pictures.BLUE, "^"))
         ):
             points = np.array([r.landings[which].residual_px for r in rows if which < len(r.landings)])
             if len(points):
@@ -160,7 +162,7 @@ def _scatter(experiment: PointingExperiment) -> Figure:
         axis.get_legend_handles_labels() for axis in figure.axes if axis.get_legend_handles_labels()[0]
     )
     figure.axes[0].legend(handles, labels, loc="upper left", fontsize=8)
-    return plots.plot(figure, "scatter of the residuals")
+    return pictures.plot(figure, "scatter of the residuals")
 
 
 def _views(experiment: PointingExperiment) -> list[tuple[str, list[list[Figure]]]]:

@@ -25,7 +25,6 @@ from mastctl.experiment.pointing import (
     PointingExperiment,
     head_pair,
     run_pointing_experiment,
-    summarise_distance,
 )
 
 if TYPE_CHECKING:
@@ -151,14 +150,5 @@ def one_pointing(task: PointingTask) -> PointingExperiment:
 
 def joined_pointings(parts: Sequence[PointingExperiment]) -> PointingExperiment:
     """Return one experiment of many with a target each; its time is that of all targets one after another."""
-    records = [record for part in parts for record in part.records]
-    seconds = dict.fromkeys(dict.fromkeys(record.distance_m for record in records), 0.0)
-    for part in parts:
-        seconds[part.records[0].distance_m] += part.seconds
-    summaries = [
-        summarise_distance(distance, [r for r in records if r.distance_m == distance], spent)
-        for distance, spent in seconds.items()
-    ]
-    return replace(
-        parts[0], records=tuple(records), summaries=tuple(summaries), seconds=sum(seconds.values())
-    )
+    records = tuple(record for part in parts for record in part.records)
+    return replace(parts[0], records=records, seconds=sum(part.seconds for part in parts))

@@ -30,9 +30,9 @@ from calib.geometry.stereo import triangulate
 from calib.matching.handoff import MatchedHandoff
 from mastctl.as_json import as_json
 from mastctl.recorder.recorded import Recording
-from mastctl.report import pages, plots
+from mastctl.report import pages, pictures
+from mastctl.report.pages import Table, x_y
 from mastctl.report.pictures import Figure
-from mastctl.report.tables import Table, x_y
 
 STEP_PX = 0.01
 STEP_RAD = 1e-6
@@ -392,7 +392,7 @@ def write_what_if(what_if: WhatIf, folder: Path) -> Path:
         summary=summary_table(what_if),
         pointings=pointing_table(what_if),
         handoffs=handoff_table(what_if),
-        plot=_plot(what_if) if what_if.columns() and plots.installed() else None,
+        plot=_plot(what_if) if what_if.columns() and pictures.can_plot() else None,
         answered=bool(what_if.columns()),
         others=other_lines(what_if),
     )
@@ -404,18 +404,18 @@ def write_what_if(what_if: WhatIf, folder: Path) -> Path:
 def _plot(what_if: WhatIf) -> Figure:
     """Residuals as recorded and as they would have been, an arrow from the one to the other."""
     columns = what_if.columns()
-    figure = plots.new(min(4.2 * len(columns), 13.0), 4.0)
+    figure = pictures.new_plot(min(4.2 * len(columns), 13.0), 4.0)
     axes = figure.subplots(1, len(columns), squeeze=False)[0]
     for axis, (key, was, would) in zip(axes, columns, strict=True):
         before, after = np.array(was), np.array(would)
         for one, other in zip(before, after, strict=True):
             axis.annotate("", other, one, arrowprops={"arrowstyle": "-", "color": "0.7", "lw": 0.8})
-        axis.plot(*before.T, "x", color=plots.RUST, ms=6, label="recorded")
-        axis.plot(*after.T, "o", color=plots.BLUE, ms=5, mfc="none", label="would be")
+        axis.plot(*before.T, "x", color=pictures.RUST, ms=6, label="recorded")
+        axis.plot(*after.T, "o", color=pictures.BLUE, ms=5, mfc="none", label="would be")
         most = 1.15 * max(0.1, float(np.abs(np.concatenate([before, after])).max()))
         axis.axhline(0.0, color="0.6", lw=0.6)
         axis.axvline(0.0, color="0.6", lw=0.6)
         axis.set(title=key, xlabel="x, px", ylabel="y, px (down)", xlim=(-most, most), ylim=(most, -most))
         axis.set_aspect("equal")
         axis.legend(fontsize=8, loc="upper right")
-    return plots.plot(figure, "residuals as recorded and as they would have been")
+    return pictures.plot(figure, "residuals as recorded and as they would have been")

@@ -1,22 +1,52 @@
-"""What a run leaves: self-contained HTML pages, and for programs tables as CSV and records as JSON.
+"""Self-contained HTML pages by templates, and the tables on them and in a terminal.
 
-Templates beside this module have the text and its order, Python the numbers: one look, light, dark and on
-paper. Everything that is put in is escaped; nothing refers to a file or an address outside the page.
+Templates beside this module have the text and its order, Python the numbers: light, dark and on paper.
+Everything that is put in is escaped; nothing refers to a file or an address outside the page.
 """
 
 from __future__ import annotations
 
-import csv
-import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, StrictUndefined
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+# How a cell with a number begins; a lone dash stands for a number that there is not.
+_NUMBER = re.compile(r"[-+±]? ?\.?\d|[-–—]$|nan$")
+
+
+class Table(NamedTuple):
+    """Headings, and rows of as many cells."""
+
+    headings: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+    def turned(self) -> Table:
+        """Return it with rows and columns exchanged: a column a distance fits a terminal of 80 columns."""
+        columns = [list(column) for column in zip(self.headings, *self.rows, strict=True)]
+        return Table(columns[0], columns[1:])
+
+    @property
+    def numeric(self) -> list[bool]:
+        """Whether each column holds numbers alone, and stands to the right."""
+        columns = zip(*self.rows, strict=True) if self.rows else [()] * len(self.headings)
+        return [all(_NUMBER.match(cell) for cell in cells if cell) for cells in columns]
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """Return a number for a cell; empty for what is unknown or not finite."""
+    return "" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
+
+
+def x_y(value: Iterable[float] | None, digits: int = 2) -> str:
+    """Return x and y for a cell; empty for what is unknown."""
+    return "" if value is None else ", ".join(f"{one:.{digits}f}" for one in value)
 
 
 @dataclass(frozen=True)
@@ -37,17 +67,11 @@ def page(template: str | Path, **values: Any) -> str:
     return _templates(beside).get_template(Path(template).name).render(**values)
 
 
-def of_daemon(status: Mapping[str, Any]) -> tuple[Badge, list[tuple[str, str]]]:
-    """Return the badge and the first facts of a page on what a daemon did, by its status."""
-    kind = str(status.get("hardware", "unknown"))
-    mast = status.get("mast") or {}
-    file = f"{mast.get('file', '')} ({str(mast.get('digest', ''))[:12]})"
-    return Badge(kind.upper(), kind), [("hardware", kind), ("mast file", file)]
-
-
 @cache
 def _templates(beside: Path | None) -> Environment:
     """The templates, and those of another folder, strict about unknown names."""
+    from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, StrictUndefined
+
     own = PackageLoader("mastctl.report")
     return Environment(
         loader=own if beside is None else ChoiceLoader([FileSystemLoader(beside), own]),
@@ -57,22 +81,3 @@ def _templates(beside: Path | None) -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-
-
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Write a table: numbers in shortest form, cells of what is not a number empty. Raises OSError."""
-    with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows([_cell(value) for value in row] for row in rows)
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, (float, np.floating)):
-        return "" if math.isnan(value) else repr(float(value))
-    return str(value)
-
-
-def write_json(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a record, a line a value. Raises OSError."""
-    path.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")

@@ -1,12 +1,17 @@
-"""Pictures: pieces of them enlarged, marked, as the bytes of a file, and as figures of a page."""
+"""Pictures and plots, as the bytes of a file and as figures of a page.
+
+Plots need matplotlib, an extra of the installation (``report``): `can_plot` before one is begun.
+"""
 
 from __future__ import annotations
 
 import base64
+import io
 import struct
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -90,3 +95,31 @@ def with_text(png: bytes, texts: Mapping[str, str]) -> bytes:
 
     chunks = (chunk(key.encode("latin-1") + b"\0\0\0\0\0" + text.encode()) for key, text in texts.items())
     return png[:33] + b"".join(chunks) + png[33:]
+
+
+BLUE, RUST, GREEN, VIOLET, AMBER, GREY = "#1f6f8b", "#c1440e", "#2d7d46", "#7a4b9d", "#b26a00", "#555555"
+COLOURS = (BLUE, RUST, GREEN, VIOLET, AMBER, GREY)
+DPI = 110
+
+
+def can_plot() -> bool:
+    """Return whether matplotlib is installed."""
+    try:
+        import matplotlib.figure  # noqa: F401
+    except ImportError:
+        return False
+    return True
+
+
+def new_plot(width_inch: float, height_inch: float) -> Any:
+    """Return an empty matplotlib figure, which no screen and no global state knows of."""
+    from matplotlib import figure
+
+    return figure.Figure(figsize=(width_inch, height_inch), layout="constrained")
+
+
+def plot(figure: Any, alt: str, caption: str = "", kind: str = "lines") -> Figure:
+    """Return a plot as a figure of a page; ``kind`` as `Figure` has it."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI)
+    return Figure(data_url(buffer.getvalue(), "png"), alt, caption, kind)

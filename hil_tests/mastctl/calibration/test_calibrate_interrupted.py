@@ -21,17 +21,17 @@ from hil_tests.mastctl.calibration.survey_world import navcam_rig, navcam_survey
 from mastctl.calibration import run as calibration_run
 from mastctl.calibration.run import FITS
 from mastctl.cli.main import main
-from mastctl.report import pages, plots
+from mastctl.report import pages, pictures
 
 FITTED = """
 import pickle, sys
 from mastctl.calibration import run
 from mastctl.cli.main import main
-from mastctl.report import plots
+from mastctl.report import pictures
 with open(sys.argv[1], "rb") as kept:
     fit = pickle.load(kept)
 run.FITS["paper"] = run.fit_joint = lambda *ignored: fit
-plots.installed = lambda: False
+pictures.can_plot = lambda: False
 """
 """The command in a process of its own, with a fit that is there already and a report of words alone."""
 
@@ -62,7 +62,7 @@ def one_fit(fitted: Calibration, monkeypatch: pytest.MonkeyPatch) -> None:
     """The survey is fitted once, and no plot is drawn: what comes after the fit is tried here."""
     monkeypatch.setitem(FITS, "paper", lambda survey, mast_parameters: fitted)
     monkeypatch.setattr(calibration_run, "fit_joint", lambda survey, mast_parameters: fitted)
-    monkeypatch.setattr(plots, "installed", lambda: False)
+    monkeypatch.setattr(pictures, "can_plot", lambda: False)
 
 
 def words(survey: Path, out: Path, *more: str) -> list[str]:

@@ -10,8 +10,8 @@ import pytest
 from jinja2 import UndefinedError
 
 from mastctl.report import pages
+from mastctl.report.pages import Table
 from mastctl.report.pictures import Figure, data_url
-from mastctl.report.tables import Table
 
 STUDY = Path(__file__).with_name("study.html")
 EVIL = "<script>alert('x')</script> & \"quoted\""
