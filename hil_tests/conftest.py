@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
-from hil_tests.left_behind import OwnFolder, end_all_of, left_at_home, places_at_home
+from hil_tests.left_behind import OwnFolder, end_all_of
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 VM_CONFTEST = REPOSITORY / "hil_tests" / "vm" / "conftest.py"
@@ -54,7 +54,6 @@ tempfile.tempdir = None  # asks the environment again
 os.environ["XDG_STATE_HOME"] = str(OWN.keep("state"))
 os.environ["MASTCTL_HEADS"] = str(OWN.keep("heads"))
 os.environ.pop("STATE_DIRECTORY", None)
-AT_HOME = places_at_home()
 LEFT = pytest.StashKey[list[str]]()
 
 
@@ -133,7 +132,7 @@ def pytest_runtest_logfinish(nodeid: str) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Fail a run that leaves something behind; a worker tells the one who prints, who looks at home."""
+    """Fail a run that leaves something behind; a worker tells the one who prints."""
     config = session.config
     workers = config.pluginmanager.getplugin("dsession")
     if workers is None:  # it runs tests itself
@@ -143,7 +142,6 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     if hasattr(config, "workeroutput"):
         config.workeroutput["left"] = config.stash[LEFT]
         return
-    config.stash[LEFT] += left_at_home(AT_HOME)
     if config.stash[LEFT] and session.exitstatus == pytest.ExitCode.OK:
         session.exitstatus = pytest.ExitCode.TESTS_FAILED
 

@@ -182,6 +182,9 @@ def _main() -> bool:
     import mastctl.cli.main
     import mastctl.cli.service
     import mastctl.daemon  # noqa: F401
+    from hil_tests.left_behind import live_in
+
+    live_in(Path(tempfile.gettempdir()) / "home")  # the asking process's own folder
 
     gc.collect()
     gc.freeze()

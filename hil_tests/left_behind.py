@@ -1,8 +1,8 @@
 """What tests leave behind: threads, descriptors, processes, temporary files, and daemons' state at home.
 
 Each process that runs tests has a folder of its own as ``TMPDIR``, which all that it starts inherits. So what
-it left can be told from what others do on the same machine at the same time. Where daemons keep the state of
-their heads is one place for all: what is new there since the run began counts unless another process uses it.
+it left can be told from what others do on the same machine at the same time. The home in which daemons keep
+the places of their heads is in that folder too.
 """
 
 from __future__ import annotations
@@ -55,26 +55,19 @@ def held() -> set[object]:
     return found
 
 
-def places_at_home() -> set[Path]:
-    """State folders of daemons and places of heads, which outlive them whatever a test's environment says."""
-    homes = {Path.home()}
-    with suppress(KeyError):  # a user whom the password database does not know
-        homes.add(Path(pwd.getpwuid(os.getuid()).pw_dir))
-    folders = [Path("/var/lib/mastctl"), *(home / ".local/state/mastctl" for home in homes)]
-    found = {place for folder in folders for kind in ("*", "heads/*") for place in folder.glob(kind)}
-    return {place for place in found if place.name != "heads"}
+def live_in(home: Path) -> None:
+    """Have the password database name a home for this process and its forks.
 
+    The place of a head at a true line is in that home whatever a test's environment says. In the user's own
+    one it could not be known which of the programs that run at the same time has made it.
+    """
+    entry_of = pwd.getpwuid
 
-def left_at_home(before: set[Path]) -> list[str]:
-    """Return what is new there, and no other process uses."""
-    used = _held_by_others()
-    return [str(place) for place in sorted(places_at_home() - before) if place.stat().st_ino not in used]
+    def getpwuid(user: int, /) -> pwd.struct_passwd:
+        found = entry_of(user)
+        return found if user != os.getuid() else pwd.struct_passwd((*found[:5], str(home), found.pw_shell))
 
-
-def _held_by_others() -> set[int]:
-    """The inodes of what other processes have locked, as a daemon locks its folders (proc_locks(5))."""
-    locks = [line.split() for line in Path("/proc/locks").read_text().splitlines()]
-    return {int(words[-3].rpartition(":")[2]) for words in locks if words[-4] != str(os.getpid())}
+    pwd.getpwuid = getpwuid
 
 
 class OwnFolder:
@@ -90,9 +83,10 @@ class OwnFolder:
         run = os.environ.get(RUN_OF_WORKERS, "")[:8]
         self.path = Path(tempfile.mkdtemp(prefix=f"mastctl-tests-{run}", dir=beside))
         self._first_seen: dict[str, str] = {}
-        self._ours: set[str] = set()
+        self._ours: set[str] = {"home"}
         self._owner = os.getpid()
         atexit.register(self._remove)
+        live_in(self.path / "home")
 
     def keep(self, name: str) -> Path:
         """Return a folder in it that is no test's, and stays to the end."""
@@ -114,6 +108,7 @@ class OwnFolder:
             f"{self.path / name} (first seen after {self._first_seen[name]})"
             for name in sorted({one.name for one in self.path.iterdir()} - self._ours)
         ]
+        things += [str(place) for place in sorted((self.path / "home").glob(".local/state/mastctl/heads/*"))]
         return things + [f"process {pid}: {words}" for pid, words in sorted(self._processes().items())]
 
     def _processes(self) -> dict[int, str]:
