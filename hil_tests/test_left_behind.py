@@ -34,7 +34,7 @@ def test_it():
     place = pathlib.Path(pwd.getpwuid(os.getuid()).pw_dir, ".local/state/mastctl/heads/usb-1234-left")
     place.mkdir(parents=True)
 """,
-    "place that another run left": """
+    "place of another run": """
 import os, pathlib
 def test_it():
     pathlib.Path(os.environ["USERS"], ".local/state/mastctl/heads/outside_devices_Head").mkdir(parents=True)
@@ -50,7 +50,13 @@ LEFT_BY_IT = {
 
 @pytest.mark.parametrize(
     ("what", "workers"),
-    [("nothing", 0), ("process", 0), ("place of a head", 0), ("place that another run left", 0), ("folder", 1)],
+    [
+        ("nothing", 0),
+        ("process", 0),
+        ("place of a head", 0),
+        ("place of another run", 0),
+        ("folder", 1),
+    ],
 )
 def test_what_is_left_behind_fails_the_run(repository: Path, tmp_path: Path, what: str, workers: int) -> None:
     (tmp_path / "conftest.py").write_text(CONFTEST)
@@ -72,7 +78,7 @@ def test_what_is_left_behind_fails_the_run(repository: Path, tmp_path: Path, wha
         os.kill(int(process), signal.SIGKILL)
     assert " passed" in done.stdout and "failed" not in done.stdout, done.stdout + done.stderr
     assert not [*tmp_path.glob("temporary/mastctl-*")]  # it clears away what it complains of
-    if what in ("nothing", "place that another run left"):
+    if what in ("nothing", "place of another run"):
         assert done.returncode == 0 and told == []
     else:
         (line,) = told

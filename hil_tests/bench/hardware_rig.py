@@ -17,8 +17,8 @@ from drivers.feetech.servos import FeetechLink
 from drivers.hardware import DeviceSettings
 from mastctl.config import load_config
 from mastctl.service.masts import bounds_of
-from mastctl.testing.drivers.head_trial import HeadTrial
 from mastctl.testing.drivers.plugin import head_under_test
+from mastctl.testing.drivers.test_head import HeadTrial
 
 READERS: dict[str, Any] = {"dynamixel": dynamixel_settings, "feetech": feetech_settings}
 CHOSEN: str | None = None

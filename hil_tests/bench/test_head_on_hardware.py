@@ -14,9 +14,9 @@ import pytest
 
 from hil_tests.bench.hardware_rig import CHOSEN, error_registers, hardware_trial
 from mastctl.config import load_config
-from mastctl.conform.checks import NotTried
+from mastctl.conform.device_checks import NotTried
 from mastctl.testing.drivers import test_head as suite
-from mastctl.testing.drivers.head_trial import HeadTrial
+from mastctl.testing.drivers.test_head import HeadTrial
 
 if CHOSEN is None:
     pytest.skip("moves a real head; name its configuration with --hardware FILE", allow_module_level=True)

@@ -13,8 +13,10 @@ from contextlib import suppress
 from dataclasses import replace
 from typing import TypeVar
 
+import numpy as np
 import pytest
 
+from calib.geometry.rigid import FloatArray
 from drivers.errors import DriverError, LineLost, NoReply
 from drivers.interfaces import Reading
 from drivers.simulation_clock import MAX
@@ -27,7 +29,7 @@ from mastctl.daemon import RunningDaemon
 from mastctl.experiment.pointing import run_pointing_experiment
 from mastctl.experiment.simulated import simulated_config, simulation_truth
 from mastctl.testing.drivers import test_head as suite
-from mastctl.testing.drivers.head_trial import HeadTrial
+from mastctl.testing.drivers.test_head import HeadTrial
 
 REAL = [name for name in RIGS if name != "in_memory"]
 WIRES = ["dynamixel", "feetech", "ptu"]
@@ -51,13 +53,24 @@ def wired(request: pytest.FixtureRequest) -> Iterator[HeadRig]:
         yield made
 
 
-def trial_of(rig: HeadRig) -> HeadTrial:
-    """The rig as the acceptance of heads takes one."""
-    return HeadTrial(
-        rig.head, LIMITS_RAD, 1.0, limits_rad=LIMITS_RAD, own_limits=True,
-        count_rad=rig.count_rad, settle_rad=rig.settle_rad,
-        true_rad=rig.true_rad, clock=rig.clock,
-    )  # fmt: skip
+class TrueTrial(HeadTrial):
+    """The rig as the acceptance of heads takes one; every reading is compared with the motors."""
+
+    def __init__(self, rig: HeadRig) -> None:
+        super().__init__(
+            rig.head, LIMITS_RAD, 1.0, limits_rad=LIMITS_RAD,
+            count_rad=rig.count_rad, settle_rad=rig.settle_rad, clock=rig.clock,
+        )  # fmt: skip
+        self.rig = rig
+
+    def read(self) -> Reading:
+        began_s = self.clock.now_s()
+        reading = super().read()
+        assert true_enough(self.rig, reading, began_s, self.clock.now_s())
+        return reading
+
+    def angles_at(self, moments_s: FloatArray, readings: list[Reading]) -> FloatArray:
+        return np.array([self.rig.true_rad(float(moment_s)) for moment_s in moments_s])
 
 
 def settled(rig: HeadRig) -> Reading:
@@ -132,7 +145,7 @@ def true_reading(rig: HeadRig) -> Reading:
 
 @pytest.mark.parametrize("promise", [name for name in vars(suite) if name.startswith("test_")])
 def test_every_head_keeps_every_promise(rig: HeadRig, promise: str) -> None:
-    getattr(suite, promise)(trial_of(rig))
+    getattr(suite, promise)(TrueTrial(rig))
 
 
 @pytest.mark.parametrize("name", REAL)
@@ -153,7 +166,7 @@ def test_over_a_real_line_it_moves_and_comes_back_after_a_pulled_plug(name: str)
 def test_no_axis_goes_faster_than_asked_or_than_its_own_bound(rig: HeadRig, asked: float) -> None:
     assert rig.fastest_rad_per_s is not None
     bound = min(asked, rig.fastest_rad_per_s)
-    fastest, unsure = suite.fastest_seen(trial_of(rig), asked)
+    fastest, unsure = TrueTrial(rig).fastest_seen(asked)
     assert fastest <= bound * 1.02 + unsure
     assert fastest >= min(bound, 1.0) * 0.3, "nor much slower"
 

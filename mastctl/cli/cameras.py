@@ -69,11 +69,10 @@ def camera_list(args: argparse.Namespace) -> Answer:
 )
 def camera_check(args: argparse.Namespace) -> Answer:
     """Compare some seconds of a camera's frames with what a driver promises, and show what it can do."""
-    from drivers.clock import SystemClock
-    from mastctl.setup.camera_check import CameraCheck
+    from mastctl.conform.device_checks import CameraTrial
 
     with opened_camera(args) as (camera, size_px):
-        found = CameraCheck(args.camera, camera, SystemClock(), size_px).run(args.seconds)
+        found = CameraTrial(args.camera, camera, size_px, args.seconds).summary
         found |= getattr(camera, "abilities", dict)()  # and what else a driver knows of its camera
         if (identity := getattr(camera, "identity", None)) is not None:
             found |= {name: getattr(identity, name) for name in ("driver", "card", "bus")}
@@ -129,7 +128,7 @@ def camera_grab(args: argparse.Namespace) -> Answer:
 )
 def camera_focus(args: argparse.Namespace) -> Answer:
     """Show the sharpness twice a second, and the best so far, as bars."""
-    from mastctl.setup.camera_check import sharpness
+    from mastctl.conform.device_checks import sharpness
 
     best, seen = 0.0, []
     with opened_camera(args) as (camera, _):

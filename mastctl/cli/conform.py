@@ -12,7 +12,7 @@ from mastctl.cli.options import command, one_of, option, positive_number
 from mastctl.cli.output import Answer, Shown, WrongUse
 
 if TYPE_CHECKING:
-    from mastctl.conform.checks import Check, CheckOutcome
+    from mastctl.conform.rig import Check, CheckOutcome
 
 MARKS = {"passed": "ok", "failed": "FAILED", "skipped": "-"}
 
@@ -49,10 +49,9 @@ def _conform(args: argparse.Namespace) -> Answer:
         motion = _may_move(args, checks, bool(rig.began.get("simulated")))
         report = check_rig(rig, checks, motion, (lambda outcome: None) if args.json else _show)
     counts = ", ".join(f"{count} {state}" for state, count in report.counts.items())
-    verdict = "conforms" if report.conforms else "does not conform"
-    return Answer(
-        report.as_json(), f"daemon {report.subject} {verdict}: {counts}", 0 if report.conforms else 1
-    )
+    document = report.as_json()
+    verdict = "conforms" if document["conforms"] else "does not conform"
+    return Answer(document, f"daemon {report.subject} {verdict}: {counts}", int(not document["conforms"]))
 
 
 def _may_move(args: argparse.Namespace, checks: Sequence[Check], simulated: bool) -> bool:

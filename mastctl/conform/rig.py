@@ -7,27 +7,21 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
 from mastctl.client import Client, ClientError, Snapshot
-from mastctl.conform.checks import (
-    Check,
-    CheckOutcome,
-    ConformReport,
-    NotTried,
-    SubjectLost,
-    expect,
-    outcome_of,
-)
+from mastctl.conform.device_checks import NotTried, PromiseBroken, expect
 from mastctl.errors import NotNow
 
 log = logging.getLogger(__name__)
 
 Angles = tuple[float, float]
+State = Literal["passed", "failed", "skipped"]
+STATES: tuple[State, ...] = ("passed", "failed", "skipped")
 
 ENDED = ("done", "failed", "stopped")
 ARRIVED_RAD = 0.006  # where the service lets a move end
@@ -35,6 +29,60 @@ POLL_S = 0.02
 OPERATION_S = 60.0
 TIMEOUT_S = 20.0
 STOP_TRIES, STOP_TIMEOUT_S = 3, 5.0
+
+
+@dataclass(frozen=True)
+class Check:
+    """One promise, a sentence, and the function that tests it; ``name`` is ``group.name``.
+
+    ``moves``: whether the head moves for it, or would if the promise were broken. ``test`` returns a short
+    text of what was measured, and raises PromiseBroken, NotTried or ClientError.
+    """
+
+    name: str
+    promise: str
+    moves: bool
+    test: Callable[[RigTrial], str | None]
+
+
+@dataclass(frozen=True)
+class CheckOutcome:
+    """The outcome of a check; ``message`` says what was measured, what is wrong, or why it was skipped."""
+
+    name: str
+    promise: str
+    state: State
+    message: str
+    duration_s: float
+
+
+@dataclass(frozen=True)
+class ConformReport:
+    """The outcomes of the checks of one rig; ``subject`` is the daemon's address.
+
+    ``may_move`` is why the head may still move, one sentence; empty when it was stopped, or never moved.
+    """
+
+    subject: str
+    outcomes: Sequence[CheckOutcome]
+    may_move: str = ""
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many passed, failed and were skipped."""
+        states = [outcome.state for outcome in self.outcomes]
+        return {state: states.count(state) for state in STATES}
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as JSON; it ``conforms`` if none failed, one at least passed, and the head is at rest."""
+        counts = self.counts
+        return {
+            "subject": self.subject,
+            "conforms": counts["failed"] == 0 < counts["passed"] and not self.may_move,
+            **counts,
+            "may_move": self.may_move,
+            "checks": [asdict(outcome) for outcome in self.outcomes],
+        }
 
 
 class RigTrial:
@@ -45,9 +93,9 @@ class RigTrial:
         self.reach_rad = reach_rad
         self.began = self.status()
 
-    def status(self) -> dict[str, Any]:
+    def status(self) -> Mapping[str, Any]:
         """Return the status."""
-        return dict(self.client.status())
+        return self.client.status()
 
     def joints(self, status: Mapping[str, Any] | None = None) -> Angles:
         """Return the measured angles, radians, of a status or of now."""
@@ -60,11 +108,6 @@ class RigTrial:
         """Pan's and tilt's limits, radians, as the daemon reports them."""
         limits = self.began["limits"]
         return tuple(limits["pan_rad"]), tuple(limits["tilt_rad"])
-
-    @property
-    def speed_rad_per_s(self) -> float:
-        """The fastest speed, as the daemon reports it."""
-        return float(self.began["limits"]["speed_rad_per_s"])
 
     @cached_property
     def box_rad(self) -> tuple[Angles, Angles]:
@@ -102,7 +145,7 @@ class RigTrial:
         """Take a picture that is exposed from now on."""
         return self.client.snapshot(camera)
 
-    def ended(self, name: str, each: Callable[[dict[str, Any]], object] = lambda status: None) -> Any:
+    def ended(self, name: str, each: Callable[[Mapping[str, Any]], object] = lambda status: None) -> Any:
         """Wait until an operation has ended and return its record; ``each`` is given the status meanwhile."""
         until_s = time.monotonic() + OPERATION_S
         while (record := self.client.operation(name)).get("state") not in ENDED:
@@ -118,7 +161,7 @@ class RigTrial:
         """Start a pointing to joint angles; return its id."""
         return self.client.point(pan_rad=goal[0], tilt_rad=goal[1])
 
-    def point(self, goal: Angles, each: Callable[[dict[str, Any]], object] = lambda status: None) -> Any:
+    def point(self, goal: Angles, each: Callable[[Mapping[str, Any]], object] = lambda status: None) -> Any:
         """Point to joint angles; return the record of the operation, which has to be done."""
         record = self.ended(self.start(goal), each)
         expect(
@@ -140,7 +183,7 @@ class RigTrial:
         else:
             time.sleep(duration_s)
 
-    def rest(self, within_s: float = 10.0) -> dict[str, Any]:
+    def rest(self, within_s: float = 10.0) -> Mapping[str, Any]:
         """Wait until nothing moves and nothing runs; return the status."""
         until_s = time.monotonic() + within_s
         while (status := self.status())["moving"] or status["operation"] is not None:
@@ -179,20 +222,31 @@ def check_rig(
     lost = left = ""
     try:
         for check in checks:
-            reason = f"not tried after {lost}" if lost else "the head may not move"
-            outcome = CheckOutcome(check.name, check.promise, "skipped", reason, 0.0)
+            began_s, gone = time.monotonic(), False
+            state: State = "skipped"
+            message = f"not tried after {lost}" if lost else "the head may not move"
             if not lost and (motion or not check.moves):
-                try:
-                    outcome = outcome_of(check, trial)
-                except SubjectLost as error:
-                    lost = check.name
-                    outcome = replace(outcome, state="failed", message=str(error))
-            outcomes.append(outcome)
-            report(outcome)
+                state, message, gone = _tried(check, trial)
+            lost = check.name if gone else lost
+            duration_s = time.monotonic() - began_s
+            outcomes.append(CheckOutcome(check.name, check.promise, state, message, duration_s))
+            report(outcomes[-1])
     finally:
         if motion and any(check.moves for check in checks):
             left = _stopped_at_the_end(trial.client.url)
     return ConformReport(trial.client.url, outcomes, left)
+
+
+def _tried(check: Check, trial: RigTrial) -> tuple[State, str, bool]:
+    """Run one check; return its state and message, and whether the daemon does not answer any more."""
+    try:
+        return "passed", check.test(trial) or "", False
+    except NotTried as reason:
+        return "skipped", str(reason), False
+    except (PromiseBroken, ClientError) as error:
+        return "failed", str(error), getattr(error, "code", "") == "no_daemon"
+    except Exception as error:  # a daemon of another version may answer anything
+        return "failed", f"{type(error).__name__}: {' '.join(str(error).split())[:200]}", False
 
 
 def _stopped_at_the_end(url: str) -> str:

@@ -6,7 +6,7 @@ import hashlib
 import itertools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
@@ -15,8 +15,8 @@ import numpy as np
 
 from drivers.interfaces import CameraSetting
 from mastctl.client import ClientError, Snapshot
-from mastctl.conform.checks import Check, NotTried, PromiseBroken, expect, settings_tried
-from mastctl.conform.rig import ARRIVED_RAD, POLL_S, Angles, RigTrial
+from mastctl.conform.device_checks import NotTried, PromiseBroken, expect, settings_tried
+from mastctl.conform.rig import ARRIVED_RAD, POLL_S, Angles, Check, RigTrial
 
 RIG: list[Check] = []
 """The checks in the order in which they run."""
@@ -159,7 +159,7 @@ def _settings_of(trial: RigTrial, camera: str) -> str:
 def _pointing(trial: RigTrial) -> str:
     worst_rad, readings = 0.0, list[tuple[float, Angles]]()
 
-    def note(status: dict[str, Any]) -> None:
+    def note(status: Mapping[str, Any]) -> None:
         angles = trial.joints(status)
         readings.append((status["joints"]["measured_s"], angles))
         for name, angle, (low, high) in zip(("pan", "tilt"), angles, trial.limits, strict=True):
@@ -185,7 +185,7 @@ def _pointing(trial: RigTrial) -> str:
         later = next((one for one in readings[index + 1 :] if one[0] - time_s >= PACE_S), None)
         if later is not None:
             fastest = max(fastest, _away(angles, later[1]) / (later[0] - time_s))
-    limit = trial.speed_rad_per_s
+    limit = trial.began["limits"]["speed_rad_per_s"]
     bound = limit * (1 + FASTER_PART) + FASTER_RAD_PER_S
     expect(fastest <= bound, f"{fastest:.3f} rad/s was measured where the limit is {limit:g} rad/s")
     return f"within {worst_rad:.1e} rad, at most {fastest:.3f} rad/s of {limit:g} rad/s"
@@ -226,7 +226,7 @@ def _stopped_on_the_way(trial: RigTrial, goal: Angles) -> str:
     status = trial.rest(BRAKED_WITHIN_S)
     record = trial.ended(name)
     rests_rad = _away(trial.joints(status), goal)
-    if rests_rad <= ARRIVED_RAD and left_rad < 2 * trial.speed_rad_per_s * took_s:
+    if rests_rad <= ARRIVED_RAD and left_rad < 2 * trial.began["limits"]["speed_rad_per_s"] * took_s:
         return ""
     expect(
         rests_rad > ARRIVED_RAD,

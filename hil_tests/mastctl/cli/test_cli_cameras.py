@@ -10,8 +10,8 @@ import pytest
 from PIL import Image as PillowImage
 
 from mastctl.cli.main import main
+from mastctl.conform.device_checks import quality_of, sharpness
 from mastctl.report.pictures import with_text
-from mastctl.setup.camera_check import quality_of, sharpness
 
 PICTURE = np.random.default_rng(2).integers(0, 256, (48, 64), dtype=np.uint8)
 TEXTS = {"time_utc": "2026-01-02T03:04:05.678+00:00", "pan_rad": "0.1", "name": "mât, 日本"}

@@ -15,9 +15,9 @@ import pytest
 from drivers.errors import DriverError, NoReply
 from drivers.interfaces import Reading
 from hil_tests.mastctl.conform.conform_world import HERE, accepted, open_head
-from mastctl.conform.checks import SubjectLost
+from mastctl.conform.device_checks import SubjectLost
 from mastctl.testing.drivers import test_head as suite
-from mastctl.testing.drivers.head_trial import HeadTrial
+from mastctl.testing.drivers.test_head import HeadTrial
 
 LIMITS = ((-2.0, 2.0), (-2.0, 2.0))
 BOX = ((-0.4, 0.4), (-0.3, 0.3))
@@ -204,7 +204,7 @@ BROKEN: list[tuple[str, Test, type[Right]]] = [
 
 
 def trial(head: Any, **known: Any) -> HeadTrial:
-    return HeadTrial(head, BOX, 0.8, limits_rad=LIMITS, own_limits=True, **known)
+    return HeadTrial(head, BOX, 0.8, limits_rad=LIMITS, **known)
 
 
 @pytest.mark.parametrize(("test", "kind"), [one[1:] for one in BROKEN], ids=[one[0] for one in BROKEN])
@@ -231,7 +231,7 @@ def test_there_is_a_broken_head_for_every_test() -> None:
 
 def test_a_head_that_hangs_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     go = threading.Event()
-    monkeypatch.setattr("mastctl.testing.drivers.calls.call.__defaults__", (0.2,))
+    monkeypatch.setattr("mastctl.conform.device_checks.call.__defaults__", (0.2,))
 
     class Hangs(Right):
         def read(self) -> Reading:
@@ -257,15 +257,13 @@ class Head:
 def test_a_head_that_reads_nothing_true_at_the_start_is_never_moved(tmp_path: Path) -> None:
     (tmp_path / "unreadable.py").write_text(UNREADABLE)
     done = accepted(tmp_path, "--head", "unreadable:Head", "--motion")
-    assert done.returncode == 2 and "RuntimeError (no) where a DriverError is expected" in done.stdout
+    assert done.returncode == 1 and "RuntimeError (no) where a DriverError is expected" in done.stdout
     assert "its present pose is not known" in done.stdout and " passed" not in done.stdout
     assert not (tmp_path / "moved").exists()
 
 
 def test_the_suite_takes_a_driver_by_its_name_and_refuses_wrong_use(tmp_path: Path) -> None:
-    options = tmp_path / "options.json"
-    options.write_text('{"low_rad": -1.0, "high_rad": 1.0}')
-    words = ("--head", f"{HERE}:open_head", "--options", str(options))
+    words = ("--head", f"{HERE}:open_head", "--options", '{"low_rad": -1.0, "high_rad": 1.0}')
     ends = ("--limits", "-1", "1", "-1", "1", "-k", "limits", "--speed", "2")
     done = accepted(tmp_path, *words, "--motion", *ends)
     assert done.returncode == 0 and "1 passed" in done.stdout, done.stdout

@@ -16,27 +16,22 @@ from typing import Any
 
 import pytest
 
-from calib.errors import BadFile
-from calib.files import read_bytes
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
 from drivers.hardware import DeviceSettings, HardwareSettings, is_hardware
 from drivers.interfaces import Camera
-from mastctl.config import Config, load_config
-from mastctl.conform.checks import NotTried, PromiseBroken, SubjectLost
+from mastctl.config import load_config
+from mastctl.conform.device_checks import CameraTrial, NotTried, PromiseBroken, SubjectLost, beside
 from mastctl.conform.rig import Angles, box
 from mastctl.devices.judge import Limits
 from mastctl.devices.opening import Bounds, head_beside, open_one_camera
 from mastctl.errors import MastctlError
 from mastctl.service.masts import bounds_of
-from mastctl.testing.drivers.calls import beside
-from mastctl.testing.drivers.head_trial import HeadTrial, at
-from mastctl.testing.drivers.test_camera import CameraTrial
+from mastctl.testing.drivers.test_head import HeadTrial, at
 
 log = logging.getLogger(__name__)
 
 STOPS_WITHIN_S = 3.0
-MOST_BYTES = 1_000_000
 ANYWHERE: tuple[Angles, Angles] = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2))
 """Where a head may be moved of which nothing is known."""
 SIMULATED_CAMERA = "navcam_left"
@@ -47,10 +42,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group = parser.getgroup("drivers", "acceptance of mastctl drivers")
     group.addoption("--rig", metavar="FILE", help="test the head and the cameras of this configuration")
     group.addoption("--head", metavar="DRIVER", help="a head's driver: package.module:factory, or its name")
-    group.addoption("--camera", metavar="DRIVER", help="a camera's driver, or with --rig the camera's name")
-    group.addoption(
-        "--options", metavar="JSON", default="{}", help="the driver's options: JSON, or a file that has it"
-    )
+    group.addoption("--camera", metavar="DRIVER", help="a camera's driver")
+    group.addoption("--options", metavar="JSON", default="{}", help="the driver's options")
     group.addoption(
         "--motion", action="store_true", help="move the head; a simulated one is moved without it"
     )
@@ -63,7 +56,6 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--limits", type=float, nargs=4, metavar=("PAN", "PAN", "TILT", "TILT"),
         help="the head driver's own lowest and highest angles, radians; they are tried",
     )  # fmt: skip
-    group.addoption("--size", type=int, nargs=2, metavar=("W", "H"), help="of the camera's images")
     group.addoption(
         "--seconds", type=float, default=3.0, metavar="S", help="how long frames are taken (default 3)"
     )
@@ -72,11 +64,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     """Refuse options that cannot be."""
     option = config.option
-    if option.rig is None and (option.head is None) == (option.camera is None):
+    if [option.rig, option.head, option.camera].count(None) != 2:
         raise pytest.UsageError("--head DRIVER, --camera DRIVER or --rig FILE is expected, one of them")
     if option.reach <= 0.0 or option.speed <= 0.0 or option.seconds <= 0.0:
         raise pytest.UsageError("--reach, --speed and --seconds: numbers above zero are expected")
-    _own_limits(config)
+    for low, high in _own_limits(config) or ():
+        if not low < high:
+            raise pytest.UsageError(f"--limits: {low:g} {high:g} where the lower angle first is expected")
     _options(config)
 
 
@@ -88,8 +82,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Function]) -> None:
     """Leave out the tests of what the command line does not name."""
-    heads = config.option.camera is None
-    cameras = bool(_camera_names(config))
+    heads, cameras = config.option.camera is None, bool(_camera_names(config))
     items[:] = [one for one in items if (heads if "head" in one.fixturenames else cameras)]
 
 
@@ -108,20 +101,21 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, object, o
 @pytest.fixture(scope="session")
 def opened_head(request: pytest.FixtureRequest) -> Iterator[HeadTrial]:
     """The head under test, opened once; stopped and closed at the end."""
-    option = request.config.option
-    settings, bounds = _head(request.config)
-    moves = _may_move(request.config)
-    with (
-        _refusals(),
-        head_under_test(
-            settings, bounds, option.reach, option.speed, _own_limits(request.config), moves=moves
-        ) as trial,
-    ):
-        try:
-            yield trial
-        finally:
-            if moves and not trial.closed:
-                _stop(trial)
+    option, moves = request.config.option, _may_move(request.config)
+    with _refusals(), ExitStack() as stack:
+        if option.rig is None:
+            settings, bounds = device_settings(option.head, _options(request.config), "head", ""), None
+        else:
+            rig = load_config(Path(option.rig))
+            settings, bounds = rig.hardware, bounds_of(rig)
+            if is_hardware("replayed", "head", settings.pan_tilt.driver):
+                pytest.skip("a replayed head is at recorded poses only; there is no motion to test")
+        own = _own_limits(request.config)
+        opened = head_under_test(settings, bounds, option.reach, option.speed, own, moves=moves)
+        trial = stack.enter_context(opened)
+        yield trial
+        if moves and not trial.closed:
+            _stop(trial)
 
 
 @pytest.fixture
@@ -135,17 +129,16 @@ def head(request: pytest.FixtureRequest, opened_head: HeadTrial) -> HeadTrial:
 @pytest.fixture(scope="session")
 def camera(request: pytest.FixtureRequest, camera_name: str) -> Iterator[CameraTrial]:
     """A camera under test, after the head if it is one of a simulator that looks from it."""
-    option = request.config.option
-    size_px = None if option.size is None else (option.size[0], option.size[1])
+    option, size_px = request.config.option, None
     with _refusals(), ExitStack() as stack:
         if option.rig is None:
             settings = device_settings(option.camera, _options(request.config), "camera", camera_name)
         else:
-            config, bounds = _rig(option.rig)
-            chosen = {camera_name: config.hardware.cameras[camera_name]}
-            settings = replace(config.hardware, cameras=chosen)
+            config = load_config(Path(option.rig))
+            bounds = bounds_of(config)
             assert bounds.stored is not None
-            size_px = size_px or bounds.stored.rig.cameras[camera_name].model.size_px
+            size_px = bounds.stored.rig.cameras[camera_name].model.size_px
+            settings = replace(config.hardware, cameras={camera_name: config.hardware.cameras[camera_name]})
             if is_hardware("simulated", "camera", settings.cameras[camera_name].driver):
                 stack.enter_context(head_beside(settings, bounds, SystemClock(), moves=False))()
 
@@ -165,40 +158,33 @@ def head_under_test(
 
     An infinite ``reach_rad`` is all of the limits. ``own_limits_rad`` are the driver's own ends, where they
     are known: the head is sent to them, and just beyond, which its driver has to refuse. Raises as
-    `mastctl.devices.opening.devices_beside`.
+    `mastctl.devices.opening.devices_beside`, and SubjectLost if it is not known where it may be moved.
     """
-    ends = own_limits_rad or ANYWHERE
-    if bounds is None:
-        bounds = Bounds(Limits(*ends, speed_rad_per_s))
-    elif own_limits_rad is None:
-        ends = bounds.limits.pan_rad, bounds.limits.tilt_rad
-    known = own_limits_rad is not None or bounds.stored is not None
+    bounds = bounds or Bounds(Limits(*(own_limits_rad or ANYWHERE), speed_rad_per_s))
+    speed_rad_per_s = min(speed_rad_per_s, bounds.limits.speed_rad_per_s)
     with head_beside(settings, bounds, SystemClock(), moves=moves) as opened:
         head = opened()
-        counts_rad = head.judge.counts_rad.values()
-        count_rad = max(counts_rad) if len(counts_rad) == 2 else None
         again = not is_hardware("simulated", "head", settings.pan_tilt.driver)
         trial = HeadTrial(
-            head, ((0.0, 0.0), (0.0, 0.0)), min(speed_rad_per_s, bounds.limits.speed_rad_per_s),
-            limits_rad=ends if own_limits_rad is not None or (known and math.isinf(reach_rad)) else None,
-            own_limits=own_limits_rad is not None,
-            count_rad=count_rad, open_again=opened if again else None,
+            head, ((0.0, 0.0), (0.0, 0.0)), speed_rad_per_s,
+            limits_rad=own_limits_rad, open_again=opened if again else None,
         )  # fmt: skip
-        if count_rad is not None:
-            trial.settle_rad = head.info.settles_within_counts * count_rad
-        try:
-            first = trial.read()
-        except (PromiseBroken, SubjectLost, DriverError) as reason:  # the tests have to report it
-            trial.unplaced = f"its present pose is not known: {reason}"
-        else:
+        if len(head.judge.counts_rad) == 2:
+            trial.count_rad = max(head.judge.counts_rad.values())
+            trial.settle_rad = head.info.settles_within_counts * trial.count_rad
+        if moves:
+            try:
+                first = trial.read()
+            except (PromiseBroken, DriverError) as reason:
+                message = f"the head is not moved: its present pose is not known: {reason}"
+                raise SubjectLost(message) from None
             free = head.judge.free_span(at(first))
             if free is None:
-                trial.unplaced = "it is in a keep-out, or too near to one"
-            else:
-                trial.box_rad = (
-                    box(first.pan_rad, free.pan_rad, reach_rad),
-                    box(first.tilt_rad, free.tilt_rad, reach_rad),
-                )
+                raise SubjectLost("the head is not moved: it is in a keep-out, or too near to one")
+            trial.box_rad = (
+                box(first.pan_rad, free.pan_rad, reach_rad),
+                box(first.tilt_rad, free.tilt_rad, reach_rad),
+            )
         yield trial
 
 
@@ -223,23 +209,8 @@ def _refusals() -> Iterator[None]:
     """End the run in one sentence where a device cannot be opened."""
     try:
         yield
-    except (MastctlError, DriverError) as error:
+    except (MastctlError, DriverError, SubjectLost) as error:
         pytest.exit(str(error), returncode=1)
-
-
-def _rig(file: str) -> tuple[Config, Bounds]:
-    config = load_config(Path(file))
-    return config, bounds_of(config)
-
-
-def _head(config: pytest.Config) -> tuple[HardwareSettings, Bounds | None]:
-    """What opens the head, and what bounds its moves."""
-    if config.option.rig is None:
-        return device_settings(config.option.head, _options(config), "head", ""), None
-    rig, bounds = _rig(config.option.rig)
-    if is_hardware("replayed", "head", rig.hardware.pan_tilt.driver):
-        pytest.skip("a replayed head is at recorded poses only; there is no motion to test")
-    return rig.hardware, bounds
 
 
 def _may_move(config: pytest.Config) -> bool:
@@ -248,42 +219,24 @@ def _may_move(config: pytest.Config) -> bool:
 
 def _camera_names(config: pytest.Config) -> Sequence[str]:
     option = config.option
-    if option.rig is None:
-        known = SIMULATED_CAMERA if is_hardware("simulated", "camera", option.camera or "") else "camera"
-        return [] if option.camera is None else [known]
-    names = list(_rig(option.rig)[0].hardware.cameras)
-    if option.camera is not None and option.camera not in names:
-        raise pytest.UsageError(f"{option.rig} has no camera {option.camera}; it has {', '.join(names)}")
-    return names if option.camera is None else [option.camera]
+    if option.rig is not None:
+        return list(load_config(Path(option.rig)).hardware.cameras)
+    simulated = is_hardware("simulated", "camera", option.camera or "")
+    return [] if option.camera is None else [SIMULATED_CAMERA if simulated else "camera"]
 
 
 def _own_limits(config: pytest.Config) -> tuple[Angles, Angles] | None:
-    """The driver's own ends of both axes, inside those of its configuration. Raises UsageError."""
-    numbers = config.option.limits
-    if numbers is None:
-        return None
-    pan, tilt = (numbers[0], numbers[1]), (numbers[2], numbers[3])
-    for low, high in (pan, tilt):
-        if not low < high:
-            raise pytest.UsageError(f"--limits: {low:g} {high:g} where the lower angle first is expected")
-    if config.option.rig is not None:
-        limits = _rig(config.option.rig)[1].limits
-        for axis, ends, most in (("pan", pan, limits.pan_rad), ("tilt", tilt, limits.tilt_rad)):
-            if not most[0] <= ends[0] < ends[1] <= most[1]:
-                message = f"{axis} {ends[0]:g} to {ends[1]:g} is not within {most[0]:g} to {most[1]:g}"
-                raise pytest.UsageError(f"--limits: {message}, where the configuration lets it be moved")
-    return pan, tilt
+    """The driver's own ends of pan and tilt."""
+    ends = config.option.limits
+    return None if ends is None else ((ends[0], ends[1]), (ends[2], ends[3]))
 
 
 def _options(config: pytest.Config) -> dict[str, Any]:
-    """Read the driver's options: JSON, or a file that has it. Raises UsageError."""
-    text = config.option.options
+    """Read the driver's options. Raises UsageError."""
     try:
-        inline = text.lstrip().startswith(("{", "["))
-        options = json.loads(text if inline else read_bytes(text, MOST_BYTES))
-    except (BadFile, ValueError) as error:
-        message = f"--options: a JSON object, or a file that has one, is expected: {error}"
-        raise pytest.UsageError(message) from None
+        options = json.loads(config.option.options)
+    except ValueError as error:
+        raise pytest.UsageError(f"--options: a JSON object is expected: {error}") from None
     if not isinstance(options, dict):
         raise pytest.UsageError("--options: a JSON object is expected")
     return options
