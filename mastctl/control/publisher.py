@@ -1,8 +1,8 @@
-"""Each change of state published once, to listeners that get the newest and never delay a publisher.
+"""Each change of state published once, to listeners that never delay a publisher.
 
-A subscriber has at most one value of each topic and key waiting for it. One that is slow loses values in
-between, never the newest, and knows how many it lost: `Publisher.publish` neither waits nor queues. A
-listener that counts may request every value, up to a bound beyond which it loses the oldest.
+A listener in a coroutine gets the newest value of each topic and key, and may lose values in between; one
+that is a thread gets every value. Beyond a bound both lose the oldest. What is lost is counted:
+`Publisher.publish` neither waits nor queues without bound.
 
     topic       key                 value
     state       "machine"           `mastctl.control.machine.Standing`
@@ -10,7 +10,7 @@ listener that counts may request every value, up to a bound beyond which it lose
     operation   its id              `mastctl.control.operations.Operation`, with the steps so far
     track       "track"             `mastctl.motion.track.TrackStatus`
     fault       of a device, file   tuple of `mastctl.control.machine.StandingFault`, empty when healthy
-    frame       the camera's name   facts of its newest frame, without the picture
+    frame       the camera's name   facts of its newest frame, without the image
     mast        "in_use"            the mast file in use, as `GET /mast` has it
     command     its number          the record of a command; under NUMBER.end how what it began has ended
     lease       "lease"             the client that steers
@@ -23,10 +23,7 @@ import asyncio
 import contextlib
 import itertools
 import threading
-import time
-from collections.abc import Iterable
 from dataclasses import dataclass
-from types import TracebackType
 from typing import Any, Literal, Self, TypeVar, get_args
 
 Topic = Literal[
@@ -38,8 +35,6 @@ _Subscription = TypeVar("_Subscription", bound="Subscription")
 
 MOST_UNREAD = 10_000
 """Values that wait for one listener."""
-
-GONE: Any = object()
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,121 +50,106 @@ class Published:
 class Subscription:
     """What one listener has not read yet. A context manager; one thread, or one coroutine, reads it.
 
-    ``lost`` counts values that were replaced by newer ones before they were read, or found no room;
-    ``closed`` says that no more will come: it was closed, or its publisher was.
+    ``lost`` counts values that came and cannot be read any more; ``closed`` says that no more will come.
     """
 
     def __init__(
-        self, publisher: Publisher, topics: frozenset[Topic], keys: frozenset[str] | None, every: bool
+        self, publisher: Publisher, topics: tuple[Topic, ...], keys: frozenset[str] | None, every: bool
     ) -> None:
         self.lost = 0
         self.closed = False
         self._publisher = publisher
-        self._topics = topics
+        self._topics = frozenset(topics) or TOPICS
         self._keys = keys
         self._every = every
-        self._most = MOST_UNREAD
         self._unread: dict[int | tuple[Topic, str], Published] = {}
 
     def close(self) -> None:
         """Receive no more; a reader that waits is woken."""
-        self._publisher.leave(self)
-        self.finish()
+        with self._publisher.lock:
+            self._publisher.leave(self)
+            self.closed = True
+            self._wake()
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self.close()
 
-    # For the publisher
+    # For the publisher, which keeps its lock
 
     def put(self, one: Published) -> None:
-        """Keep a value for the reader, in place of an older one of the same topic and key; under the lock."""
+        """Keep a value for the reader."""
         if one.topic not in self._topics or (self._keys is not None and one.key not in self._keys):
             return
-        place = one.sequence if self._every else (one.topic, one.key)
-        self.lost += self._unread.pop(place, None) is not None
-        if one.value is not GONE:
-            self._unread[place] = one
-        if len(self._unread) > self._most:
-            del self._unread[next(iter(self._unread))]
+        was_empty = not self._unread
+        if not self._every:
+            self.forget(one.topic, one.key)
+        self._unread[one.sequence if self._every else (one.topic, one.key)] = one
+        if len(self._unread) > MOST_UNREAD:
             self.lost += 1
-        if one.value is not GONE:
+            del self._unread[next(iter(self._unread))]
+        if was_empty:
             self._wake()
 
-    def finish(self) -> None:
-        """State that no more will come."""
-        self.closed = True
-        self._wake()
+    def forget(self, topic: Topic, key: str) -> None:
+        """Drop the value of a key, unless the reader gets every value."""
+        self.lost += self._unread.pop((topic, key), None) is not None
 
     def _wake(self) -> None:
         raise NotImplementedError
 
     def _take_unread(self) -> list[Published]:
-        with self._publisher.lock:
-            unread, self._unread = self._unread, {}
-        return sorted(unread.values(), key=lambda one: one.sequence)
+        """Everything unread, oldest first."""
+        unread, self._unread = self._unread, {}
+        return list(unread.values())
 
 
 class ThreadSubscription(Subscription):
     """A subscription that a thread waits on."""
 
-    def __init__(self, publisher: Publisher, topics: frozenset[Topic], every: bool) -> None:
-        self._something = threading.Event()
-        super().__init__(publisher, topics, None, every)
+    def __init__(self, publisher: Publisher, topics: tuple[Topic, ...]) -> None:
+        super().__init__(publisher, topics, None, every=True)
+        self._news = threading.Condition(publisher.lock)
 
     def wait(self, timeout_s: float | None = None) -> list[Published]:
         """Return what is new since the last call, oldest first; wait for it for ``timeout_s`` real seconds.
 
         Empty if nothing came in that time, or `closed`. None waits for as long as it takes.
         """
-        until_s = None if timeout_s is None else time.monotonic() + timeout_s
-        while True:
-            self._something.clear()
-            unread = self._take_unread()
-            left_s = None if until_s is None else until_s - time.monotonic()
-            if unread or self.closed or (left_s is not None and left_s <= 0):
-                return unread
-            self._something.wait(left_s)
+        with self._news:
+            self._news.wait_for(lambda: self._unread or self.closed, timeout_s)
+            return self._take_unread()
 
     def _wake(self) -> None:
-        self._something.set()
+        self._news.notify_all()
 
 
 class LoopSubscription(Subscription):
     """A subscription that a coroutine waits on, of the event loop on which it was made."""
 
-    def __init__(self, publisher: Publisher, topics: frozenset[Topic], keys: frozenset[str] | None) -> None:
+    def __init__(self, publisher: Publisher, topics: tuple[Topic, ...], keys: frozenset[str] | None) -> None:
+        super().__init__(publisher, topics, keys, every=False)
         self._loop = asyncio.get_running_loop()
         self._something = asyncio.Event()
-        self._woken = False
-        super().__init__(publisher, topics, keys, every=False)
 
     async def wait(self, timeout_s: float | None = None) -> list[Published]:
         """Return what is new since the last call, oldest first; wait for it for ``timeout_s`` seconds.
 
         Empty if nothing came in that time, or `closed`. None waits for as long as it takes.
         """
-        until_s = None if timeout_s is None else self._loop.time() + timeout_s
-        while True:
-            self._something.clear()
-            self._woken = False
-            unread = self._take_unread()
-            left_s = None if until_s is None else until_s - self._loop.time()
-            if unread or self.closed or (left_s is not None and left_s <= 0):
-                return unread
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(left_s):
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                while not (self._unread or self.closed):
+                    self._something.clear()  # the loop sets it, so never in between
                     await self._something.wait()
+        with self._publisher.lock:
+            return self._take_unread()
 
     def _wake(self) -> None:
-        if not self._woken:
-            self._woken = True
-            with contextlib.suppress(RuntimeError):  # the loop has ended, and with it the reader
-                self._loop.call_soon_threadsafe(self._something.set)
+        with contextlib.suppress(RuntimeError):  # the loop has ended, and with it the reader
+            self._loop.call_soon_threadsafe(self._something.set)
 
 
 class Publisher:
@@ -200,29 +180,23 @@ class Publisher:
         with self.lock:
             self._newest.pop((topic, key), None)
             for subscription in self._subscriptions:
-                subscription.put(Published(0, topic, key, GONE))
+                subscription.forget(topic, key)
 
     def newest(self, topic: Topic, key: str) -> Any:
         """Return the newest value of a key, None before the first; takes no lock."""
         known = self._newest.get((topic, key))
         return None if known is None else known.value
 
-    def subscribe(self, *topics: Topic, known: bool = True, every: bool = False) -> ThreadSubscription:
+    def subscribe(self, *topics: Topic) -> ThreadSubscription:
         """Return a subscription for a thread; without topics to all of them.
 
-        It begins with the newest value of each key that is known already, unless ``known`` is False. With
-        ``every`` no value takes another one's place and `forget` takes none back. Beyond ``MOST_UNREAD``
-        unread values the oldest is lost, and counted in ``lost``.
+        It begins with the newest value of each key that is known already.
         """
-        return self._added(ThreadSubscription(self, _checked(topics), every), known)
+        return self._added(ThreadSubscription(self, topics))
 
-    def subscribe_here(
-        self, *topics: Topic, known: bool = True, keys: frozenset[str] | None = None
-    ) -> LoopSubscription:
-        """Return a subscription for a coroutine of the running event loop, to some keys only if they are
-        given; else as `subscribe`.
-        """
-        return self._added(LoopSubscription(self, _checked(topics), keys), known)
+    def subscribe_here(self, *topics: Topic, keys: frozenset[str] | None = None) -> LoopSubscription:
+        """Return the same for a coroutine of the running event loop, of some keys only if they are given."""
+        return self._added(LoopSubscription(self, topics, keys))
 
     @property
     def listeners(self) -> int:
@@ -233,28 +207,20 @@ class Publisher:
         """End every subscription, and each that is made later; publishing goes nowhere from then on."""
         with self.lock:
             self._closed = True
-            subscriptions, self._subscriptions = self._subscriptions, ()
-        for one in subscriptions:
-            one.finish()
-
-    def _added(self, subscription: _Subscription, known: bool) -> _Subscription:
-        with self.lock:
-            if self._closed:
-                subscription.finish()
-                return subscription
-            self._subscriptions = (*self._subscriptions, subscription)
-            for one in self._newest.values() if known else ():
-                subscription.put(one)
-        return subscription
+            for one in self._subscriptions:
+                one.close()
 
     def leave(self, subscription: Subscription) -> None:
         """Drop a subscription."""
         with self.lock:
             self._subscriptions = tuple(one for one in self._subscriptions if one is not subscription)
 
-
-def _checked(topics: Iterable[Topic]) -> frozenset[Topic]:
-    chosen = frozenset(topics)
-    if not chosen <= TOPICS:
-        raise ValueError(f"{', '.join(sorted(chosen - TOPICS))}: there is no such topic")
-    return chosen or TOPICS
+    def _added(self, subscription: _Subscription) -> _Subscription:
+        with self.lock:
+            if self._closed:
+                subscription.close()
+                return subscription
+            self._subscriptions = (*self._subscriptions, subscription)
+            for one in sorted(self._newest.values(), key=lambda one: one.sequence):
+                subscription.put(one)
+        return subscription

@@ -93,7 +93,7 @@ class Recorder:
         self._keep: tuple[float, str] | None = None  # when the ring is kept, and why
         self._kept_before: dict[tuple[str, str], float] = {}
         self._standing: set[tuple[str, str]] = set()
-        self._news = publisher.subscribe(*(TOPICS - NOT_RECORDED), every=True)
+        self._news = publisher.subscribe(*(TOPICS - NOT_RECORDED))
         self._thread = threading.Thread(target=self._work, name=NAME, daemon=True)
         self._thread.start()
 

@@ -66,7 +66,7 @@ class Metrics:
             "reading_interval_seconds", "From one reading of the head to the next.", READING_S
         )
         self._last_reading_s: float | None = None
-        self._news = publisher.subscribe("operation", "command", "frame", "joints", known=False, every=True)
+        self._news = publisher.subscribe("operation", "command", "frame", "joints")
         self._thread = threading.Thread(target=self._count, name="metrics", daemon=True)
         self._thread.start()
 

@@ -16,24 +16,35 @@ def told(some: list[Published]) -> list[tuple[str, str, object]]:
     return [(one.topic, one.key, one.value) for one in some]
 
 
-def test_a_slow_subscriber_gets_the_newest_and_counts_the_lost() -> None:
+def test_a_slow_coroutine_gets_the_newest_and_counts_the_lost() -> None:
     publisher = Publisher()
-    with publisher.subscribe() as slow:
-        for number in range(1000):
-            publisher.publish("joints", "head", number)
-            publisher.publish("frame", f"camera {number % 2}", number)
-        assert told(slow.wait(0)) == [
-            ("frame", "camera 0", 998), ("joints", "head", 999), ("frame", "camera 1", 999),
-        ]  # fmt: skip
-        assert slow.lost == 999 + 998
+
+    async def listen() -> None:
+        with publisher.subscribe_here() as slow:
+            for number in range(1000):
+                publisher.publish("joints", "head", number)
+                publisher.publish("frame", f"camera {number % 2}", number)
+                publisher.publish("operation", "1", number)
+            publisher.forget("operation", "1")
+            assert told(await slow.wait(0.0)) == [
+                ("frame", "camera 0", 998), ("joints", "head", 999), ("frame", "camera 1", 999),
+            ]  # fmt: skip
+            assert slow.lost == 999 + 998 + 1000
+            publisher.publish("operation", "2", 1)
+            publisher.forget("operation", "2")
+            assert await slow.wait(0.0) == []
+            publisher.publish("operation", "3", 1)
+            assert told(await slow.wait(NET_S)) == [("operation", "3", 1)]
+
+    asyncio.run(listen())
 
 
-def test_who_counts_hears_every_value_in_order_and_loses_the_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_thread_gets_every_value_in_order_and_loses_the_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mastctl.control.publisher.MOST_UNREAD", 4)
     publisher = Publisher()
     for key, value in (("a", 1), ("b", 2), ("a", 3)):
         publisher.publish("operation", key, value)
-    with publisher.subscribe(every=True) as counts:
+    with publisher.subscribe() as counts:
         assert [one.value for one in counts.wait(0)] == [2, 3]  # what is known, the oldest first
         for number in range(4, 8):
             publisher.publish("operation", "a", number)
