@@ -55,7 +55,8 @@ def fault(value: Mapping[str, Any]) -> None:
 
 def command(value: Mapping[str, Any]) -> None:
     """A command, its sender and its result."""
-    rr.log("log/command", rr.TextLog(f"{value['who']}: {value['command']}: {value.get('result', 'ended')}"))
+    who, name = value.get("who", "operation"), value.get("command", value.get("ended"))
+    rr.log("log/command", rr.TextLog(f"{who}: {name}: {value.get('result', 'ended')}"))
 
 
 OWN: Mapping[str, Callable[[Mapping[str, Any]], None]] = {

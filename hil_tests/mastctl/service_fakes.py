@@ -26,6 +26,7 @@ from hil_tests.waiting import NET_S
 from mastctl.answers import Step
 from mastctl.client import Client
 from mastctl.config import load_config
+from mastctl.watch.journal import JournalThread
 
 if TYPE_CHECKING:
     from mastctl.daemon import RunningDaemon
@@ -173,6 +174,13 @@ class Hang:
 
     def let_go(self) -> None:
         self._go.set()
+
+
+def on_disk(thread: JournalThread) -> None:
+    """Wait until all that was put into a thread for files is done."""
+    done = threading.Event()
+    thread.put(done.set)
+    assert done.wait(NET_S)
 
 
 def fake_step(name: str, **detail: Any) -> Step:

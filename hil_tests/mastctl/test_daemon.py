@@ -168,7 +168,7 @@ def test_a_part_that_cannot_be_closed_keeps_no_other_open(
 ) -> None:
     with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware):
         service, closed = daemon.service, list[str]()
-        named = ("bench", "metrics", "recorder", "stop_threads", "audit", "latch", "folder")
+        named = ("bench", "metrics", "recorder", "stop_threads", "journals", "latch", "folder")
         for name in named:
             part = getattr(service, name)
 

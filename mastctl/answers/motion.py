@@ -322,10 +322,10 @@ class CommandAnswer(TypedDict):
     number: Count
     time: str
     monotonic_s: float
-    command: str
-    who: str
-    role: Role
-    via: str
+    command: NotRequired[str]
+    who: NotRequired[str]
+    role: NotRequired[Role]
+    via: NotRequired[str]
     address: NotRequired[str | None]
     request: NotRequired[Json | None]
     lease: NotRequired[str | None]

@@ -9,43 +9,52 @@ program, which may have acted. A refusal changed nothing and is forgotten, so th
 
 from __future__ import annotations
 
+import contextlib
 import itertools
-import math
-import threading
+import json
+import logging
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Any, Protocol, TypeVar
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, TypeVar
 
 from drivers.clock import Clock, SystemClock
 from mastctl.answers import Role
 from mastctl.as_json import writable
-from mastctl.control.audit import AuditLog
-from mastctl.control.lease import ANONYMOUS, NETWORK, Caller, LeaseTable, StopCame
-from mastctl.control.machine import Need
+from mastctl.control.lease import ANONYMOUS, Caller, LeaseTable, StopCame
+from mastctl.control.machine import Need, StandingFault
+from mastctl.control.operations import OperationRunner
 from mastctl.control.publisher import Publisher
-from mastctl.errors import BadRequest, MastctlError, NotNow, Stopped, error_body
+from mastctl.errors import BadRequest, MastctlError, NotNow, Stopped, error_body, one_line
+from mastctl.json_lines import append_line
+
+log = logging.getLogger(__name__)
 
 Answer = TypeVar("Answer", bound=Mapping[str, Any])
 
-LONGEST_DEADLINE_S = 3600.0
 KEPT_S = 600.0
 KEPT = 4096  # keys; for more, the oldest is forgotten before its time
 LONGEST_KEY = 200
 WAIT_S = 30.0  # for the first of two, longer than any command takes that is accepted or refused
-FOLLOWED = 256  # operations whose end is still recorded with the client that began them
 PUBLISHED = 256  # records that a new listener still gets
+AUDIT, STRANGERS = "audit_log", "strangers_log"
+WAITING = 1000  # lines that wait for the disk
+FILE_BYTES = 4 << 20
+FILES, STRANGERS_FILES = 8, 2  # 32 MiB: some 100,000 commands
+LONGEST_LINE = 16384
 
 
 @dataclass(frozen=True)
 class Command:
     """A kind of command: its name in the record, the role that its caller needs, its need of the state.
 
-    ``steers``: it is refused while another client steers. ``goes_on``: it is sent again and again to keep its
-    operation going; only the first is recorded, and what is refused. ``grants``: its answer has a lease's id,
-    which proves the lease: never by a key of an anonymous client, and never of a lease that has ended.
+    ``steers``: it is refused while another client steers. ``goes_on``: with an ``id`` it keeps an operation
+    going, and is recorded only if it is refused. ``grants``: its answer has a lease's id, which proves the
+    lease: never by a key of an anonymous client, and never of a lease that has ended.
     """
 
     name: str
@@ -114,14 +123,6 @@ class CommandRequest:
     deadline_s: float | None = None
     last_stop: StopCame | None = None
 
-    def __post_init__(self) -> None:
-        deadline_s = self.deadline_s
-        if deadline_s is not None and not (
-            math.isfinite(deadline_s) and 0.0 < deadline_s <= LONGEST_DEADLINE_S
-        ):
-            expected = f"more than 0 and at most {LONGEST_DEADLINE_S:g} s is expected"
-            raise BadRequest("bad_request", f"deadline_s: {deadline_s:g} where {expected}")
-
 
 @dataclass(eq=False)
 class _Kept:
@@ -164,18 +165,14 @@ class Answers:
         with self._changed:
             now_s = self._clock.now_s()
             for old, one in list(self._kept.items()):
-                if not one.done:
-                    continue
-                if now_s - one.since_s < KEPT_S and len(self._kept) < KEPT:
-                    break
-                del self._kept[old]
+                if one.done and (now_s - one.since_s >= KEPT_S or len(self._kept) >= KEPT):
+                    del self._kept[old]
             known = self._kept.get(place)
             if known is not None:
                 return self._answer_of(known, key, request), True
             mine = self._kept[place] = _Kept(request, now_s)
         try:
-            answer = act()
-            mine.answer = answer
+            mine.answer = act()
         except BaseException as error:
             mine.error = error
             raise
@@ -184,7 +181,7 @@ class Answers:
                 if isinstance(mine.error, MastctlError):
                     del self._kept[place]
                 self._changed.notify_all()
-        return answer, False
+        return mine.answer, False
 
     def _answer_of(self, known: _Kept, key: str, request: Mapping[str, Any]) -> Any:
         """Return the answer that the first got, or gets; the lock is kept."""
@@ -203,12 +200,92 @@ class Answers:
         return known.answer
 
 
-class JudgesAndEnds(Protocol):
-    """The part of `mastctl.control.operations.OperationRunner` that the entry needs."""
+class AuditLog:
+    """A file of JSON lines of mode 0600, and those before it, ``NAME.1`` to ``NAME.7``.
 
-    def refusal(self, need: Need) -> MastctlError | None: ...
-    def end_within(self, name: str, left_s: float, allowed_s: float) -> None: ...
-    def end_stopped(self, name: str) -> None: ...
+    ``later`` has a function called in a thread that may wait for the disk; nothing else waits, and nothing
+    raises. Lines that do not fit or that the disk does not take are counted, and their number is recorded
+    where they are missing. ``device`` is the name of its fault.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        later: Callable[[Callable[[], None]], None],
+        clock: Clock,
+        file_bytes: int = FILE_BYTES,
+        files: int = FILES,
+        device: str = AUDIT,
+    ) -> None:
+        self._files = [path, *(Path(f"{path}.{number}") for number in range(1, files))]
+        self._file_bytes = file_bytes
+        self._later = later
+        self._clock = clock
+        self._device = device
+        self._waiting = deque[Mapping[str, Any]]()
+        self._lost = deque[None]()  # one for each lost line
+        self._fault: StandingFault | None = None
+
+    def put(self, record: Mapping[str, Any]) -> None:
+        """Have a record written; returns at once."""
+        if len(self._waiting) >= WAITING:
+            self._lost.append(None)
+        else:
+            self._waiting.append(record)
+            self._later(self._write)
+
+    def faults(self) -> tuple[StandingFault, ...]:
+        """Return what is wrong with the file now; takes no lock."""
+        fault = self._fault
+        return () if fault is None else (fault,)
+
+    # In the thread that may wait
+
+    def _write(self) -> None:
+        """Write the oldest line that waits."""
+        record, lost = self._waiting.popleft(), len(self._lost)
+        try:
+            lines = [{"time": datetime.now(UTC).isoformat(), "lost": lost}] if lost else []
+            self._append("".join(f"{_line(one)}\n" for one in (*lines, record)).encode())
+        except Exception as error:  # the disk's, or of a record that cannot be written; the next one may be
+            self._lost.append(None)
+            self._fail(error)
+            return
+        if lost:
+            for _ in range(lost):
+                self._lost.popleft()
+            log.warning("the audit log is written again; %d lines are missing in it", lost)
+        self._fault = None
+
+    def _append(self, text: bytes) -> None:
+        """Append lines, in a new file where this one is full."""
+        newest = self._files[0]
+        newest.parent.mkdir(parents=True, exist_ok=True)
+        if not append_line(newest, text, self._file_bytes, mode=0o600):
+            for newer, older in reversed(list(pairwise(self._files))):
+                with contextlib.suppress(FileNotFoundError):
+                    newer.replace(older)
+            append_line(newest, text, mode=0o600)
+
+    def _fail(self, error: Exception) -> None:
+        why = error.strerror if isinstance(error, OSError) else None
+        message = f"commands are not recorded: {self._files[0]}: {why or one_line(error, 200)}"
+        if self._fault is None:
+            log.error("%s", message)
+            until = "a command can be recorded again"
+            self._fault = StandingFault(self._device, "not_recorded", message, self._clock.now_s(), until)
+
+
+def _line(record: Mapping[str, Any]) -> str:
+    """A record as a line; a request that is too long for one is cut, which its key shows."""
+    line = _json(record)
+    if len(line) > LONGEST_LINE:
+        line = _json({**record, "request": {"cut": _json(record["request"])[: LONGEST_LINE // 16]}})
+    return line
+
+
+def _json(value: Any) -> str:
+    return json.dumps(writable(value), allow_nan=False, separators=(",", ":"))
 
 
 class CommandEntry:
@@ -224,7 +301,7 @@ class CommandEntry:
         leases: LeaseTable,
         answers: Answers,
         audit: AuditLog,
-        operations: JudgesAndEnds,
+        operations: OperationRunner,
         publisher: Publisher,
         strangers: AuditLog,
     ) -> None:
@@ -235,11 +312,7 @@ class CommandEntry:
         self._answers = answers
         self._operations = operations
         self._publisher = publisher
-        self._published: deque[str] = deque()  # keys, oldest first
         self._numbers = itertools.count(1)
-        self._matching = threading.Lock()
-        self._began: dict[str, dict[str, Any]] = {}  # operation: the client that began it, until it has ended
-        self._ended: dict[str, dict[str, Any]] = {}  # operation: how it ended, until its client is known
 
     def run(
         self, command: Command, sent: CommandRequest, act: Callable[[], Answer], usual_s: float | None = None
@@ -266,8 +339,9 @@ class CommandEntry:
                 answer, again = self._answers.once(
                     sent.caller.name, sent.key, same, lambda: self._act(command, sent, act, usual_s)
                 )
-                if again and command.grants:
-                    self.leases.check(answer["lease_id"], ", with another Idempotency-Key")
+                if again and command.grants and not self.leases.holds(answer["lease_id"]):
+                    message = "the lease of this Idempotency-Key has ended; acquire another with another key"
+                    raise NotNow("lease_over", message)
         except BaseException as error:
             self.record(command, sent, None, error, again)
             raise
@@ -290,20 +364,43 @@ class CommandEntry:
             raise
         finally:
             if recorded:
-                self.record(command, sent, answer, error, begins=False)
+                self.record(command, sent, answer, error)
 
     def refused(self, caller: Caller, command: str, code: str, message: str) -> None:
         """Record a request that was refused before it was a command. It is not published."""
-        line = {"number": next(self._numbers), **self._now(), **_by(command, caller), "request": {}}
-        line |= {"result": code, "message": message}
+        line = {**self._begun(), **_by(command, caller), "request": {}, "result": code, "message": message}
         (self.strangers if caller.stranger else self.audit).put(line)
 
     def ended(self, operation: str, state: str, error: Mapping[str, Any] | None) -> None:
-        """Record how an operation ended that a command began."""
-        line = {**self._now(), "ended": operation, "state": state}
+        """Record how an operation ended."""
+        line = {**self._begun(), "ended": operation, "state": state}
         if error is not None:
             line |= {"code": error.get("code"), "message": error.get("message")}
-        self._matched(self._ended, operation, line)
+        self._write(self.audit, line)
+
+    def record(
+        self,
+        command: Command,
+        sent: CommandRequest,
+        answer: Mapping[str, Any] | None,
+        error: BaseException | None,
+        again: bool = False,
+    ) -> None:
+        """Record a command's result."""
+        operation = None if answer is None else _operation_of(answer)
+        if command.goes_on and error is None and (operation is None or "id" in sent.request):
+            return
+        line = {**self._begun(), **_by(command.name, sent.caller), "request": writable(sent.request)}
+        if sent.lease is not None:
+            line["lease"] = sent.lease[:8]  # names it, without being it
+        if sent.key is not None:
+            line |= {"key": sent.key[:80], "again": again}
+        if error is None:
+            line |= {"result": "ok", "operation": operation}
+        else:
+            body = error_body(error)
+            line |= {"result": body["code"], "message": body["message"]}
+        self._write(self.strangers if sent.caller.stranger else self.audit, line)
 
     def _act(
         self, command: Command, sent: CommandRequest, act: Callable[[], Answer], usual_s: float | None
@@ -325,7 +422,7 @@ class CommandEntry:
             if operation is not None and self._stopped_since(command, sent):
                 self._operations.end_stopped(operation)
             allowed_s = usual_s if sent.deadline_s is None else sent.deadline_s
-            if operation is not None and allowed_s is not None and operation not in self._began:
+            if operation is not None and allowed_s is not None:
                 left_s = sent.came_s + allowed_s - self._clock.now_s()
                 self._operations.end_within(operation, left_s, allowed_s)
             return answer
@@ -334,55 +431,15 @@ class CommandEntry:
         """Whether a stop came after the request of a command that steers."""
         return command.steers and sent.last_stop not in (None, self.leases.last_stop)
 
-    def record(
-        self,
-        command: Command,
-        sent: CommandRequest,
-        answer: Mapping[str, Any] | None,
-        error: BaseException | None,
-        again: bool = False,
-        begins: bool = True,
-    ) -> None:
-        """Record a command's result; a stop's begins no operation, though its answer names one."""
-        caller = sent.caller
-        operation = None if answer is None else _operation_of(answer)
-        if command.goes_on and error is None and (operation is None or operation in self._began):
-            return
-        by = _by(command.name, caller)
-        number = next(self._numbers)
-        line = {"number": number, **self._now(), **by, "request": writable(sent.request)}
-        if sent.lease is not None:
-            line["lease"] = sent.lease[:8]  # names it, without being it
-        if sent.key is not None:
-            line |= {"key": sent.key[:80], "again": again}
-        if error is None:
-            line |= {"result": "ok", "operation": operation}
-        else:
-            body = error_body(error)
-            line |= {"result": body["code"], "message": body["message"]}
-        self._write(line)
-        if operation is not None and begins and not again:
-            self._matched(self._began, operation, {"number": number, **by})
+    def _write(self, log_of: AuditLog, line: dict[str, Any]) -> None:
+        log_of.put(line)
+        self._publisher.publish("command", str(line["number"]), line)
+        self._publisher.forget("command", str(line["number"] - PUBLISHED))
 
-    def _matched(self, known: dict[str, dict[str, Any]], operation: str, line: dict[str, Any]) -> None:
-        """Keep an operation's client, or how it ended; record the end when both are known."""
-        with self._matching:
-            known[operation] = line
-            if operation in self._began and operation in self._ended:
-                self._write({**self._began.pop(operation), **self._ended.pop(operation)})
-            while len(known) > FOLLOWED:
-                del known[next(iter(known))]
-
-    def _write(self, line: dict[str, Any]) -> None:
-        (self.strangers if line["via"] == NETWORK else self.audit).put(line)
-        key = f"{line['number']}.end" if "ended" in line else f"{line['number']}"
-        self._publisher.publish("command", key, line)
-        self._published.append(key)
-        while len(self._published) > PUBLISHED:
-            self._publisher.forget("command", self._published.popleft())
-
-    def _now(self) -> dict[str, Any]:
-        return {"time": datetime.now(UTC).isoformat(), "monotonic_s": self._clock.now_s()}
+    def _begun(self) -> dict[str, Any]:
+        """The beginning of a line: its number and its time."""
+        time = datetime.now(UTC).isoformat()
+        return {"number": next(self._numbers), "time": time, "monotonic_s": self._clock.now_s()}
 
 
 def _by(command: str, caller: Caller) -> dict[str, Any]:

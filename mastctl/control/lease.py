@@ -10,20 +10,17 @@ Reading (`LeaseTable.control`) takes no lock.
 from __future__ import annotations
 
 import contextlib
-import hmac
 import logging
-import math
 import secrets
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
-from typing import Literal
 
 from drivers.clock import Clock
 from mastctl.answers import ControlAnswer, LeaseRuns, Role
-from mastctl.errors import BadRequest, NotAllowed, NotNow, one_line
+from mastctl.errors import NotAllowed, NotNow, one_line
 
 log = logging.getLogger(__name__)
 
@@ -83,9 +80,10 @@ def client_name(header: str | None) -> str:
 class Leased(NotNow):
     """Another client steers; ``detail`` has its name, and for how long."""
 
-    def __init__(self, control: Steerer, now_s: float) -> None:
-        self.detail = control.as_json(now_s)
-        super().__init__("leased", f"{control.sentence(now_s)}; wait, or take over with a reason")
+    def __init__(self, control: ControlAnswer) -> None:
+        self.detail, for_s = control, control["for_s"]
+        until = "until what runs has ended" if for_s is None else f"for {for_s:.1f} s more"
+        super().__init__("leased", f"{control['holder']} steers, {until}; wait, or take over with a reason")
 
 
 class LeaseOver(NotNow):
@@ -120,34 +118,11 @@ class Lease:
     caller: str = ""
 
 
-@dataclass(frozen=True)
-class Steerer:
-    """The client that steers, by a lease until ``until_s`` of its clock, or until what it began has ended."""
-
-    holder: str
-    kind: Literal["lease", "operation"]
-    until_s: float | None = None
-
-    def as_json(self, now_s: float) -> ControlAnswer:
-        """Return it as JSON: what is left in seconds, and when that is by the wall clock (UTC)."""
-        left_s = None if self.until_s is None else max(0.0, self.until_s - now_s)
-        until = None if left_s is None else _by_the_wall(left_s)
-        return {"holder": self.holder, "kind": self.kind, "for_s": left_s, "until": until}
-
-    def sentence(self, now_s: float) -> str:
-        """Return it as a sentence."""
-        if self.until_s is None:
-            return f"{self.holder} steers, until what runs has ended"
-        return f"{self.holder} steers, for {max(0.0, self.until_s - now_s):.1f} s more"
-
-
 class LeaseTable:
     """The lease of one daemon, or the client that steers without one; safe to use from any thread.
 
     ``running``: whether an operation or a track runs; called with the lock kept, so it must take none.
-    ``on_change``: gets the client that steers after each change. ``stop``: stops what runs; gets the reason.
-    Called without the lock.
-
+    ``on_change`` follows each change; ``stop`` stops what runs, and gets the reason: both without the lock.
     ``token_is_valid``: of a token's digest; called with the lock kept, from any thread.
     """
 
@@ -155,7 +130,7 @@ class LeaseTable:
         self,
         clock: Clock,
         running: Callable[[], bool],
-        on_change: Callable[[Steerer | None], None] = lambda control: None,
+        on_change: Callable[[], None] = lambda: None,
         stop: Callable[[str], object] = lambda why: None,
     ) -> None:
         self._clock = clock
@@ -172,24 +147,20 @@ class LeaseTable:
         self._left = ""  # why what runs is to be stopped: its lease has ended
         self._closing = threading.Event()
 
-    def control(self) -> Steerer | None:
-        """Return the client that steers now, None without one."""
+    def control(self) -> ControlAnswer | None:
+        """Return the client that steers now as ``GET /status`` has it; takes no lock."""
         lease = self._lease
         if lease is not None and not self._over_by(lease):
-            return Steerer(lease.holder, "lease", lease.until_s)
+            return {"kind": "lease", **self.lease_as_json(lease)}
         under_way = next(iter(tuple(self._under_way.values())), None)
         party = under_way or (self._party if self._running() else None)
-        return None if party is None else Steerer(party, "operation")
-
-    def as_json(self) -> ControlAnswer | None:
-        """Return the client that steers as ``GET /status`` has it."""
-        control = self.control()
-        return None if control is None else control.as_json(self._clock.now_s())
+        return None if party is None else {"holder": party, "kind": "operation", "for_s": None, "until": None}
 
     def lease_as_json(self, lease: Lease) -> LeaseRuns:
-        """Return a lease as its holder gets it, whichever client steers meanwhile."""
+        """Return a lease as its holder gets it: what is left of it, and its end by the wall clock (UTC)."""
         left_s = max(0.0, lease.until_s - self._clock.now_s())
-        return {"holder": lease.holder, "for_s": left_s, "until": _by_the_wall(left_s)}
+        until = datetime.now(UTC) + timedelta(seconds=left_s)
+        return {"holder": lease.holder, "for_s": left_s, "until": until.isoformat()}
 
     @property
     def last_stop(self) -> StopCame:
@@ -205,17 +176,20 @@ class LeaseTable:
         return lease.last_stop is not None and lease.last_stop is not self._last_stop
 
     def acquire(
-        self, caller: Caller, name: str | None = None, for_s: float = USUAL_S, ends_with_stop: bool = False
+        self,
+        caller: Caller,
+        name: str | None = None,
+        for_s: float = USUAL_S,
+        last_stop: StopCame | None = None,
     ) -> Lease:
         """Return a new lease of ``for_s`` seconds if no other client steers; what the caller runs is its own.
 
-        ``name`` is the holder's, the caller's by default. With ``ends_with_stop`` it ends with the next stop
-        of the head. Raises Leased; BadRequest if ``for_s`` is out of bounds.
+        ``name`` is the holder's, the caller's by default. With ``last_stop`` it ends with the first stop of
+        the head after that one. Raises Leased.
         """
-        _check_time(for_s)
         with self._changing():
             self._check_free(caller)
-            return self._grant(caller, name, for_s, self._last_stop if ends_with_stop else None)
+            return self._grant(caller, name, for_s, last_stop)
 
     def watch(self) -> None:
         """Stop what runs whenever its lease has run out or lost its token, until `close`."""
@@ -249,25 +223,14 @@ class LeaseTable:
         lease = self._lease
         return lease is not None and lease.id == lease_id and not self._over_by(lease)
 
-    def check(self, lease_id: str, remedy: str) -> None:
-        """Pass a lease that runs now. Raises NotNow as `renew`, with a remedy."""
-        try:
-            with self._changing():
-                self._running_lease(lease_id)
-        except NotNow as over:
-            raise NotNow(over.code, f"{over}{remedy}") from None
-
     def renew(self, lease_id: str, for_s: float | None = None) -> Lease:
         """Have a lease run for ``for_s`` seconds from now on, by default as long as at first; return it.
 
-        Raises NotNow ``lease_over`` with how it ended, ``lease_unknown``; BadRequest if ``for_s`` is out of
-        bounds.
+        Raises NotNow ``lease_over`` with how it ended, ``lease_unknown``.
         """
-        if for_s is not None:
-            _check_time(for_s)
         with self._changing():
             lease = self._running_lease(lease_id)
-            for_s = lease.for_s if for_s is None else for_s
+            for_s = for_s or lease.for_s
             self._lease = replace(lease, for_s=for_s, until_s=self._clock.now_s() + for_s)
             return self._lease
 
@@ -285,22 +248,18 @@ class LeaseTable:
         name: str | None = None,
         for_s: float = USUAL_S,
         last_stop: StopCame | None = None,
-        ends_with_stop: bool = False,
     ) -> Lease:
         """Return a new lease, whichever client steers; the former holder gets the new one's name and reason.
 
-        What runs under a lease is stopped; there is no lease if the head does not confirm that. With
-        ``last_stop`` the new one ends with the first stop after that one. Else as `acquire`; raises
-        DriverError, BadRequest.
+        What runs under a lease is stopped; there is no lease if the head does not confirm that. Else as
+        `acquire`; raises DriverError.
         """
-        _check_time(for_s)
+        how = f"{name or caller.name} took over: {reason}"
         with self._changing():
-            self._end(f"{name or caller.name} took over: {reason}")
+            self._end(how)
         self.stop_left_running()
         with self._changing():
-            self._end(f"{name or caller.name} took over: {reason}")  # another client's since then
-            if last_stop is None and ends_with_stop:
-                last_stop = self._last_stop
+            self._end(how)  # another client's since then
             return self._grant(caller, name, for_s, last_stop)
 
     @contextmanager
@@ -349,7 +308,7 @@ class LeaseTable:
                     changed = self._lease is not before
         finally:
             if changed:
-                self._on_change(self.control())
+                self._on_change()
 
     def _over_by(self, lease: Lease) -> str:
         """What has ended a lease that was not released or taken, '' if nothing has; takes no lock."""
@@ -364,13 +323,13 @@ class LeaseTable:
     def _check_free(self, caller: Caller) -> None:
         """Pass unless a lease runs, or a client of another name steers. Raises Leased."""
         control = self.control()
-        if control is not None and (control.kind == "lease" or control.holder != caller.name):
-            raise Leased(control, self._clock.now_s())
+        if control is not None and (control["kind"] == "lease" or control["holder"] != caller.name):
+            raise Leased(control)
 
     def _running_lease(self, lease_id: str) -> Lease:
         """Return the lease that runs, if it is this one."""
         lease = self._lease
-        if lease is not None and hmac.compare_digest(lease.id.encode(), lease_id.encode()):
+        if lease is not None and lease.id == lease_id:
             return lease
         how = self._over.get(lease_id)
         if how is None:
@@ -399,15 +358,3 @@ class LeaseTable:
         """Note what runs under a lease that has ended, for `stop_left_running`."""
         if self._running():
             self._left = f"{lease.holder} began it, and its lease has ended: {how}"
-
-
-def _by_the_wall(left_s: float) -> str:
-    return (datetime.now(UTC) + timedelta(seconds=left_s)).isoformat()
-
-
-def _check_time(for_s: float) -> None:
-    """Pass how long a lease may be. Raises BadRequest."""
-    if not (math.isfinite(for_s) and SHORTEST_S <= for_s <= LONGEST_S):
-        raise BadRequest(
-            "bad_request", f"for_s: {for_s:g} where {SHORTEST_S:g} to {LONGEST_S:g} seconds are expected"
-        )

@@ -12,7 +12,7 @@ that is a thread gets every value. Beyond a bound both lose the oldest. What is 
     fault       of a device, file   tuple of `mastctl.control.machine.StandingFault`, empty when healthy
     frame       the camera's name   facts of its newest frame, without the image
     mast        "in_use"            the mast file in use, as `GET /mast` has it
-    command     its number          the record of a command; under NUMBER.end how what it began has ended
+    command     its number          the record of a command, or of an operation's end
     lease       "lease"             the client that steers
     bench       "run"               `mastctl.answers.BenchRunRecord`, the bench calibration as it is known
 """

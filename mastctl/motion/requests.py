@@ -13,7 +13,6 @@ from pydantic.dataclasses import dataclass
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid
 from mastctl.answers import PointingResult
-from mastctl.control.entry import LONGEST_DEADLINE_S
 from mastctl.devices.frames import StampedFrame, check_known
 from mastctl.errors import BadRequest, MastctlError, NotNow
 
@@ -21,6 +20,7 @@ CHECKED = ConfigDict(extra="forbid", allow_inf_nan=False)
 """Unknown keys and numbers that are not finite are refused, and by the types below what only looks right."""
 LARGEST_PX = 1e5
 LARGEST_M = 1e6
+LONGEST_DEADLINE_S = 3600.0
 
 Name = Annotated[str, Field(strict=True, min_length=1, max_length=200)]
 Pixel = Annotated[float, Field(strict=True, ge=-LARGEST_PX, le=LARGEST_PX)]

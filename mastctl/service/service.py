@@ -11,7 +11,7 @@ import math
 import random
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
@@ -40,9 +40,17 @@ from mastctl.answers import (
 from mastctl.as_json import as_json
 from mastctl.bench.operation import BenchOperation
 from mastctl.config import Config, check_cameras, load_config
-from mastctl.control.audit import STRANGERS, STRANGERS_FILES, AuditLog
-from mastctl.control.entry import ESTOP, STOP, Answers, CommandEntry, CommandRequest
-from mastctl.control.lease import Caller, LeaseTable, Steerer
+from mastctl.control.entry import (
+    ESTOP,
+    STOP,
+    STRANGERS,
+    STRANGERS_FILES,
+    Answers,
+    AuditLog,
+    CommandEntry,
+    CommandRequest,
+)
+from mastctl.control.lease import Caller, LeaseTable
 from mastctl.control.machine import StandingFault, StateMachine
 from mastctl.control.operations import Operation, OperationRunner, last_frame
 from mastctl.control.publisher import Topic
@@ -144,9 +152,11 @@ class Service:
         real_time = SystemClock()  # clients live in it, whatever a simulated rover's clock does
         self.leases = LeaseTable(real_time, self.machine.something_runs, self._steered, self.stopping.stop)
         threading.Thread(target=self.leases.watch, name="leases", daemon=True).start()
-        self.audit = AuditLog(self.folder.path / AUDIT_FILE, clock)
-        strangers = self.folder.path / STRANGERS_FILE
-        self.strangers = AuditLog(strangers, clock, files=STRANGERS_FILES, device=STRANGERS)
+        later = self.journals.put
+        self.audit = AuditLog(folder.path / AUDIT_FILE, later, clock)
+        self.strangers = AuditLog(
+            folder.path / STRANGERS_FILE, later, clock, files=STRANGERS_FILES, device=STRANGERS
+        )
         answers = Answers(real_time, clock)
         self.entry = CommandEntry(
             clock, self.leases, answers, self.audit, self.operations, publisher, self.strangers
@@ -280,7 +290,7 @@ class Service:
             "limits": as_json(self.config.limits),
             "pose": None if track.pose is None else track.pose.as_json(now_s),
             "track": {"state": track.state, "reason": track.reason, "id": track.id},
-            "control": self.leases.as_json(),
+            "control": self.leases.control(),
             "stop_socket": None if self.stop_socket is None else str(self.stop_socket.path),
             "calibration": self.mast_verdict(),
             "sentinel": self.sentinel.summary(),
@@ -300,7 +310,7 @@ class Service:
         if topic == "track":
             return self.track_answer(value)
         if topic == "lease":
-            return {"control": self.leases.as_json()}
+            return {"control": self.leases.control()}
         return published_value(topic, value, self.clock.now_s())
 
     def mast_verdict(self) -> CalibrationAnswer:
@@ -424,7 +434,7 @@ class Service:
                 return
             self._closed = True
         folders = self.folder, self.head_folder, self._socket_folder
-        maybe = (self.stop_socket, self.audit, self.strangers, self.latch, *folders)
+        maybe = (self.stop_socket, self.journals, self.latch, *folders)
         first_to_last: tuple[Callable[[], object], ...] = (
             self.leases.close,
             self.operations.close,
@@ -432,7 +442,6 @@ class Service:
             self.devices.close,
             self.machine.publisher.close,
             self.metrics.close,
-            self.journals.close,
             self.recorder.close,
             self._close_hardware,
             self.stop_threads.close,
@@ -529,10 +538,9 @@ class Service:
         self.handoffs.use_mast(stored.digest)
         self.health.use_mast(stored)
 
-    def _steered(self, control: Steerer | None) -> None:
+    def _steered(self) -> None:
         """Publish which client steers."""
-        value = None if control is None else asdict(control)
-        self.machine.publisher.publish("lease", "lease", value)
+        self.machine.publisher.publish("lease", "lease", self.leases.control())
 
     def _ended(self, operation: Operation) -> None:
         """Have an operation's end recorded, and its last image kept for later."""

@@ -151,7 +151,7 @@ class JournalThread:
         busy = self._busy_since_s
         if busy is None or self._file_time.now_s() - busy[1] <= SLOW_S:
             return ()
-        message = "a file of the drift watch does not answer; hand-offs and residuals wait for it"
+        message = "a file of the state folder does not answer; hand-offs, residuals and commands wait for it"
         return (StandingFault(NAME, "slow", message, busy[0], "the file answers"),)
 
     def close(self) -> None:
@@ -159,7 +159,7 @@ class JournalThread:
         self._queue.put(None)
         self._thread.join(CLOSE_S)
         if self._thread.is_alive():
-            log.error("a file of the drift watch does not answer; the newest records are not kept")
+            log.error("a file of the state folder does not answer; the newest records are not kept")
 
     def _work(self) -> None:
         polled_s = time.monotonic()

@@ -193,7 +193,7 @@ async def stop_first(
                 requested = replace(requested, request=await late())
         finally:
             if late is not None or isinstance(failure, StopsHang):
-                entry.record(kind, requested, answer, failure, begins=False)
+                entry.record(kind, requested, answer, failure)
 
 
 async def stopped(service: Service, stop: Callable[[], T]) -> T:

@@ -242,13 +242,13 @@ def add_lease(app: FastAPI) -> None:
 
     @app.get(f"{PREFIX}/lease", summary="Who steers")
     async def control(here: Here) -> answers.LeaseAnswer:
-        return {"control": here.service.leases.as_json()}
+        return {"control": here.service.leases.control()}
 
     @command(app, "POST /lease", entry.LEASE)
     def acquire(body: LeaseBody, here: Here, requested: Requested) -> answers.LeaseGranted:
         """Acquire the lease, if no other client steers."""
         leases = here.service.leases
-        return _granted(leases, leases.acquire(requested.caller, **_terms(body)))
+        return _granted(leases, leases.acquire(requested.caller, **_terms(body, requested)))
 
     @command(
         app,
@@ -269,19 +269,20 @@ def add_lease(app: FastAPI) -> None:
         """Release the lease."""
         leases = here.service.leases
         leases.release(_lease_of(requested))
-        return {"control": leases.as_json()}
+        return {"control": leases.control()}
 
     @command(app, "POST /lease/take", entry.LEASE_TAKE)
     def take(body: TakeBody, here: Here, requested: Requested) -> answers.LeaseGranted:
         """Take the lease from its holder; what runs under it is stopped."""
         leases = here.service.leases
-        return _granted(leases, leases.take(requested.caller, body.reason, **_terms(body)))
+        return _granted(leases, leases.take(requested.caller, body.reason, **_terms(body, requested)))
 
 
-def _terms(body: LeaseBody) -> dict[str, Any]:
+def _terms(body: LeaseBody, requested: CommandRequest) -> dict[str, Any]:
     """What a lease is granted with, by the names of `LeaseTable.acquire`."""
-    terms = body.model_dump(exclude={"reason"})
-    return terms | {"name": None if body.name is None else client_name(body.name)}
+    name = None if body.name is None else client_name(body.name)
+    last_stop = requested.last_stop if body.ends_with_stop else None
+    return {"name": name, "for_s": body.for_s, "last_stop": last_stop}
 
 
 def _granted(leases: LeaseTable, lease: Lease) -> answers.LeaseGranted:

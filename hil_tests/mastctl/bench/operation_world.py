@@ -170,7 +170,7 @@ def world(folder: Path, work: Script, simulated: bool = True) -> Iterator[World]
     leases = LeaseTable(
         SystemClock(),
         lambda: stops.running is not None,
-        lambda control: publisher.publish("lease", "lease", None),
+        lambda: publisher.publish("lease", "lease", None),
         stops.stop,
     )
     bench = BenchOperation(folder / "state", lambda: masts, leases, publisher, simulated, work)

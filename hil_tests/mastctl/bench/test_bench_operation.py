@@ -24,7 +24,7 @@ from hil_tests.mastctl.bench.operation_world import (
     world,
     writes_files,
 )
-from hil_tests.waiting import until
+from hil_tests.waiting import present, until
 from mastctl.control.lease import Caller
 from mastctl.errors import NotKnown, NotNow
 
@@ -47,7 +47,7 @@ def test_a_run_is_followed_over_a_placement_to_its_verdict(tmp_path: Path) -> No
         requested = made.until("waiting")["requested"]
         assert requested is not None and requested["turned_deg"] == [20.0, 0.0]
         assert requested["needs_confirmation"]
-        assert made.leases.control().holder == "bench calibration"  # type: ignore[union-attr]
+        assert present(made.leases.control())["holder"] == "bench calibration"
         made.bench.stands()
         run = made.until("done")
         assert made.leases.control() is None and made.lent == []

@@ -16,7 +16,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from hil_tests.mastctl.service_fakes import PLAIN, fake_daemon
+from hil_tests.mastctl.service_fakes import PLAIN, fake_daemon, on_disk
 from hil_tests.mastctl.web.network import NAME, Network, network_daemon
 from hil_tests.waiting import NET_S, until
 from mastctl.answers import Role
@@ -268,8 +268,7 @@ def test_a_wrong_cookie_opens_nothing_and_is_replaced_by_a_token(net: Network) -
 def recorded(net: Network, strangers: bool = False) -> list[dict[str, Any]]:
     """The audit log, or that of strangers."""
     service = net.daemon.service
-    log = service.strangers if strangers else service.audit
-    assert log.flush(NET_S)
+    on_disk(service.journals)
     path = service.folder.path / ("strangers.jsonl" if strangers else "audit.jsonl")
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 

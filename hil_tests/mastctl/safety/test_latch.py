@@ -18,7 +18,7 @@ import pytest
 from calib.errors import BadFile
 from drivers.errors import DriverError
 from hil_tests.mastctl.outside_daemon import daemon_process, line, write_config
-from hil_tests.mastctl.service_fakes import CONFIG, Hang, ScriptedLoop, fake_daemon
+from hil_tests.mastctl.service_fakes import CONFIG, Hang, ScriptedLoop, fake_daemon, on_disk
 from hil_tests.waiting import NET_S, present, until
 from mastctl.client import Client, ClientError
 from mastctl.control import machine as machine_module
@@ -287,7 +287,7 @@ def test_an_emergency_stop_acts_before_its_reason_has_come(
         assert (cause["reason"], cause["name"]) == ("a hand", "Ana")
         assert present(client.wait(operation)["error"])["message"] == "an emergency stop was requested"
         until(lambda: b"a hand" in (tmp_path / "state" / FILE).read_bytes(), "the disk has it")
-        assert daemon.service.audit.flush(NET_S)
+        on_disk(daemon.service.journals)
         lines = map(json.loads, (tmp_path / "state" / "audit.jsonl").read_text().splitlines())
         (estop,) = [one for one in lines if one.get("command") == "estop"]
         assert estop["request"] == {"reason": "a hand", "name": "Ana"}
