@@ -158,7 +158,7 @@ class Booted:
         return done.stdout + done.stderr
 
     def mastctl(self, *words: str, fails: bool = False) -> str:
-        named = "MASTCTL_URL=http://127.0.0.1:8420"  # another user's daemon is commanded by its address alone
+        named = "MASTCTL_URL=http://127.0.0.1:8420"
         return self.run("/usr/bin/env", named, "/opt/mastctl/bin/mastctl", *words, fails=fails)
 
     def status(self, *words: str) -> dict[str, Any]:

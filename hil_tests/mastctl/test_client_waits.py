@@ -1,4 +1,4 @@
-"""Waits of the client: by events, nothing missed, whatever becomes of stream and daemon."""
+"""Waits of the client: nothing is missed, whatever becomes of connection and daemon."""
 
 from __future__ import annotations
 
@@ -13,13 +13,10 @@ from typing import Any
 import pytest
 
 from hil_tests.mastctl.outside_daemon import daemon_process, line, under_way, write_config
-from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop, fake_step
+from hil_tests.mastctl.service_fakes import ScriptedLoop, fake_step
 from hil_tests.waiting import NET_S, until
 from mastctl.client import Client, ClientError
-from mastctl.client import connection as connection_module
-from mastctl.daemon import RunningDaemon
-
-BOTH = tuple[RunningDaemon, FakeHardware]
+from mastctl.client.connection import Broken, DaemonHttp
 
 
 @pytest.fixture
@@ -37,65 +34,28 @@ def go(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     return let
 
 
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Paths of the requests that this process's clients send."""
-    paths: list[str] = []
-    plain = connection_module.DaemonHttp.send
-
-    def send(self: Any, method: str, path: str, **options: Any) -> Any:
-        paths.append(f"{method} {path}")
-        return plain(self, method, path, **options)
-
-    monkeypatch.setattr(connection_module.DaemonHttp, "send", send)
-    return paths
-
-
-def test_a_wait_asks_once_and_then_listens(
-    client: Client, go: threading.Event, pair: BOTH, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    operation = client.point(pan_rad=0.0, tilt_rad=0.0)
-    paths, steps = asked(monkeypatch), []
-    publisher = pair[0].service.machine.publisher
-    before = publisher.listeners
-
-    def on_step(step: Any) -> None:
-        steps.append(step["name"])
-
+def test_a_wait_shows_each_step_as_it_comes(client: Client, go: threading.Event) -> None:
+    operation, steps = client.point(pan_rad=0.0, tilt_rad=0.0), list[str]()
     with ThreadPoolExecutor(1) as pool:
-        waiting = pool.submit(client.wait, operation, NET_S, on_step)
-        until(lambda: publisher.listeners > before and steps == ["look"], "it listens")
+        waiting = pool.submit(client.wait, operation, NET_S, lambda step: steps.append(step["name"]))
+        until(lambda: steps == ["look"], "the first step")
         go.set()
         assert waiting.result(NET_S)["state"] == "done"
     assert steps == ["look", "look", "measure"]
-    assert paths == [f"GET /api/v1/operations/{operation}"]
 
 
-def test_an_end_between_the_question_and_the_subscription_is_not_missed(
-    client: Client, go: threading.Event, pair: BOTH, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    operation = client.point(pan_rad=0.0, tilt_rad=0.0)
-    operations, heard = pair[0].service.operations, connection_module.DaemonHttp.heard
-
-    def after_the_end(self: Any, *args: Any) -> Any:
-        go.set()
-        until(lambda: operations.get(operation).state == "done", "it has ended")
-        return heard(self, *args)
-
-    monkeypatch.setattr(connection_module.DaemonHttp, "heard", after_the_end)
-    assert client.wait(operation, timeout_s=NET_S)["state"] == "done"
-
-
-def test_a_daemon_killed_while_a_client_listens_is_one_plain_sentence(
+def test_a_daemon_killed_while_a_client_waits_is_one_plain_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    heard, listens = connection_module.DaemonHttp.heard, threading.Event()
+    send, waits = DaemonHttp.send, threading.Event()
 
-    def noted(self: Any, *args: Any) -> Any:
-        for event in heard(self, *args):
-            listens.set()
-            yield event
+    def noted(self: DaemonHttp, method: str, path: str, **options: Any) -> Any:
+        answer = send(self, method, path, **options)
+        if "/operations/" in path:
+            waits.set()
+        return answer
 
-    monkeypatch.setattr(connection_module.DaemonHttp, "heard", noted)
+    monkeypatch.setattr(DaemonHttp, "send", noted)
     with (
         daemon_process(tmp_path, write_config(tmp_path)) as daemon,
         Client(line(daemon)) as client,
@@ -105,7 +65,7 @@ def test_a_daemon_killed_while_a_client_listens_is_one_plain_sentence(
         under_way(client)
         operation = client.status()["operation"]
         waiting = pool.submit(waiter.wait, operation, 2.0 * NET_S)
-        assert listens.wait(NET_S)
+        assert waits.wait(NET_S)
         daemon.kill()
         with pytest.raises(ClientError) as told:
             waiting.result(NET_S)  # it does not wait for its whole time
@@ -114,35 +74,23 @@ def test_a_daemon_killed_while_a_client_listens_is_one_plain_sentence(
     assert "no daemon answers at" in str(told.value)
 
 
-def test_a_stream_that_breaks_is_begun_again(
-    client: Client, go: threading.Event, pair: BOTH, monkeypatch: pytest.MonkeyPatch
+def test_a_wait_goes_on_where_an_answer_is_lost(
+    client: Client, go: threading.Event, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     operation = client.point(pan_rad=0.0, tilt_rad=0.0)
-    heard = connection_module.DaemonHttp.heard
-    broken: list[Any] = []
+    send, sent = DaemonHttp.send, list[str]()
 
-    def breaking(self: Any, *args: Any) -> Any:
-        for event in heard(self, *args):
-            yield event
-            if len(broken) < 2:
-                broken.append(event)
-                raise connection_module.Broken("no_daemon", "the connection broke")
+    def lossy(self: DaemonHttp, method: str, path: str, **options: Any) -> Any:
+        sent.append(path)
+        if len(sent) in (2, 3):
+            raise Broken("no_daemon", "the connection broke")
+        if len(sent) == 4:
             go.set()
+        return send(self, method, path, **options)
 
-    monkeypatch.setattr(connection_module.DaemonHttp, "heard", breaking)
+    monkeypatch.setattr(DaemonHttp, "send", lossy)
     assert client.wait(operation, timeout_s=NET_S)["state"] == "done"
-    assert len(broken) == 2
-
-
-def test_a_state_is_waited_for(client: Client, go: threading.Event) -> None:
-    words: list[str] = []
-    client.point(pan_rad=0.0, tilt_rad=0.0)
-    client.wait_state("moving", timeout_s=NET_S)
-    go.set()
-    told = client.wait_state("ready", timeout_s=NET_S, on_change=lambda one: words.append(one["state"]))
-    assert told["state"] == words[-1] == "ready"
-    with pytest.raises(ClientError, match=r"the state is ready and not stopped after 0\.2 s"):
-        client.wait_state("stopped", timeout_s=0.2)
+    assert len(sent) >= 4
 
 
 def test_a_wait_on_a_daemon_that_hangs_ends_with_its_time() -> None:

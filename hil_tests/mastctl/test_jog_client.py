@@ -14,7 +14,7 @@ from hil_tests.mastctl.service_fakes import FakeHardware
 from hil_tests.waiting import NET_S, until
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
-from mastctl.client.jog import Jog
+from mastctl.client.steering import Jog
 from mastctl.daemon import RunningDaemon
 
 HANGING = """

@@ -38,9 +38,9 @@ OVERVIEW: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "panorama": ("panorama requests", "take a panorama, any pixel of which points the mast"),
         "snapshot": ("service", "take a picture and write it to a file"),
         "record": ("record requests", "begin and end a recording; list, inspect, repair and replay them"),
-        "stop": ("stop", "stop the mast at once; --without-daemon if that is dead"),
-        "estop": ("stop", "stop the mast at once; nothing moves it until 'mastctl reset'"),
-        "reset": ("stop", "release an emergency stop; nothing moves by that"),
+        "stop": ("daemon", "stop the mast at once; --without-daemon if that is dead"),
+        "estop": ("daemon", "stop the mast at once; nothing moves it until 'mastctl reset'"),
+        "reset": ("daemon", "release an emergency stop; nothing moves by that"),
     },
     "geometry, on files": {
         "camera": ("camera_files cameras requests", "camera files, and cameras on this machine"),
@@ -57,11 +57,11 @@ OVERVIEW: Mapping[str, Mapping[str, tuple[str, str]]] = {
     },
     "a rig of your own": {
         "rig": (
-            "rig requests servos sentinel",
+            "rig requests servos",
             "write a rig's files; its servos, lease, tokens, mast file, drift",
         ),
         "schema": ("rig", "print the JSON Schema of a file that people write"),
-        "ros2": ("ros2", "a ROS 2 node of a running daemon, until Ctrl-C"),
+        "ros2": ("service", "a ROS 2 node of a running daemon, until Ctrl-C"),
     },
     "the paper's experiments": {
         "demo": ("experiment", "the pointing experiment on the packaged simulated rover"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import pwd
 import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
@@ -275,14 +274,6 @@ def check_folder(path: Path | None, option: str) -> None:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise unusable(f"{option} {path}", f"nothing can be written to {folder}: {reason}") from None
-
-
-def user_name(uid: int) -> str:
-    """Return the name of a user of this machine, or the number of one without a name."""
-    try:
-        return pwd.getpwuid(uid).pw_name
-    except KeyError:
-        return str(uid)
 
 
 def unusable(what: str, why: str) -> CommandError:

@@ -1,16 +1,18 @@
-"""Commands that send a daemon one request and print its answer, as rows of a table; and its tokens."""
+"""Commands on a daemon whose answer is a record: most send one request; tokens; the drift sentinel."""
 
 from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
+from urllib.parse import quote
 
 from mastctl.cli import output
 from mastctl.cli.daemon import CONFIG, DAEMON, URL, client_of
-from mastctl.cli.options import GROUPS, Option, command, finite_number, option
+from mastctl.cli.options import GROUPS, Option, angle_rad, command, finite_number, option
 from mastctl.cli.output import Answer, CommandError, WrongUse, check_file, tables_at
 
 if TYPE_CHECKING:
@@ -22,6 +24,7 @@ GROUPS |= {
     "rig token": "tokens of a daemon that is reached from other machines",
     "rig mast": "the mast file that a running daemon points by",
     "rig fault": "the faults of a simulated rover",
+    "rig sentinel": "notice a bumped camera, a slipped joint, a lens refocused",
 }
 
 TRACK = "state pair range_m position_m predicted operation reason self_check.offsets.sentence"
@@ -30,16 +33,19 @@ TRACK = "state pair range_m position_m predicted operation reason self_check.off
 FOR = option("--for S", "how long, seconds up to 3600 (default: 30, or as before)", dest="for_s")
 OWN_LEASE = (URL, CONFIG, option("--lease ID", "as 'mastctl rig lease take' prints it", required=True))
 
+Send = Callable[["Client", argparse.Namespace], Mapping[str, Any]]
+
 
 class Request(NamedTuple):
-    """A command of one request.
+    """A command of one request: ``POST /mast file`` has a path, with the values of arguments in braces, and
+    the arguments that its body has; or a function sends it.
 
     People see ``line``, with keys of the answer in braces, or else its values at ``keys``, or all of it.
     """
 
     name: str
     help: str
-    send: Callable[[Client, argparse.Namespace], Mapping[str, Any]]
+    send: str | Send
     options: tuple[Option, ...] = ()
     example: str = ""
     line: str = ""
@@ -49,7 +55,18 @@ class Request(NamedTuple):
     def run(self, args: argparse.Namespace) -> Answer:
         """Send it and return the answer."""
         with client_of(args) as client:
-            answer = self.send(client, args)
+            if isinstance(self.send, str):
+                method, path, *names = self.send.split()
+                given = {
+                    name: quote(value, safe="")
+                    for name, value in vars(args).items()
+                    if isinstance(value, str)
+                }
+                answer = client.request(
+                    method, path.format_map(given), **{n: getattr(args, n) for n in names}
+                )
+            else:
+                answer = dict(self.send(client, args))
         if self.line:
             return Answer(answer, self.line.format_map(answer))
         return Answer(answer, tables_at(answer, self.keys))
@@ -67,11 +84,6 @@ def _mast(client: Client, args: argparse.Namespace) -> Mapping[str, Any]:
 def _clear_faults(client: Client, args: argparse.Namespace) -> Mapping[str, Any]:
     client.clear_faults(args.device)
     return {"faults": client.faults()}
-
-
-def _release(client: Client, args: argparse.Namespace) -> Mapping[str, Any]:
-    client.release_lease()
-    return {"released": True}
 
 
 def _parameter(text: str) -> tuple[str, float]:
@@ -96,7 +108,7 @@ def _settings(client: Client, args: argparse.Namespace) -> Mapping[str, Any]:
 CHANGED_MAST = "{mast[file]} ({mast[name]}) is in use, before {former_mast[file]}"
 
 REQUESTS = (
-    Request("rig lease show", "show the client that steers", lambda client, _: {"control": client.control()}),
+    Request("rig lease show", "show the client that steers", "GET /lease"),
     Request(
         "rig lease take",
         "acquire the lease and print its id, for --lease; with --reason from its holder",
@@ -112,14 +124,15 @@ REQUESTS = (
     Request(
         "rig lease renew",
         "have a lease run on from now",
-        lambda client, args: client.renew_lease(args.for_s),
+        "POST /lease/renew for_s",
         (FOR,),
         "--lease 0f3c --for 60",
         keys="holder for_s until",
         daemon=OWN_LEASE,
     ),
     Request(
-        "rig lease release", "let others steer", _release, (), "--lease 0f3c", "released", daemon=OWN_LEASE
+        "rig lease release", "let others steer", "DELETE /lease", (), "--lease 0f3c", "released",
+        daemon=OWN_LEASE,
     ),
     Request(
         "rig mast show",
@@ -131,18 +144,18 @@ REQUESTS = (
     Request(
         "rig mast use",
         "use another of the same folder; pictures taken before are refused",
-        lambda client, args: client.use_mast(args.name),
-        (option("NAME", "its name, without a folder"),),
+        "POST /mast file",
+        (option("NAME", "its name, without a folder", dest="file"),),
         "rocky8-refined.yaml",
         CHANGED_MAST,
     ),
     Request(
         "rig mast back",
         "go back to the one that was in use before",
-        lambda client, _: client.use_former_mast(),
+        "POST /mast/back",
         line=CHANGED_MAST,
     ),
-    Request("rig fault list", "show which are switched on", lambda client, _: {"faults": client.faults()}),
+    Request("rig fault list", "show which are switched on", "GET /simulation/faults"),
     Request(
         "rig fault set",
         "switch one on",
@@ -164,12 +177,12 @@ REQUESTS = (
     Request(
         "rig reload",
         "have the daemon read its configuration again; all of it comes into use, or nothing",
-        lambda client, _: client.reload(),
+        "POST /reload",
     ),
     Request(
         "record start",
         "have the daemon record until 'record stop'",
-        lambda client, args: client.start_recording(args.name),
+        "POST /recordings/start name",
         (option("[NAME]", "part of the file's name", default=""),),
         "afternoon",
         "recording {run} in {folder}; 'mastctl record stop' ends it",
@@ -177,13 +190,13 @@ REQUESTS = (
     Request(
         "record stop",
         "end the recording that 'record start' began",
-        lambda client, _: client.stop_recording(),
+        "POST /recordings/stop",
         keys="file size_mb dropped",
     ),
     Request(
         "record list",
         "list the daemon's recordings: runs, what faults kept, the ring",
-        lambda client, _: client.recordings(),
+        "GET /recordings",
         keys="recordings.kind recordings.name recordings.size_mb recordings.files recorder",
     ),
     Request(
@@ -199,29 +212,29 @@ REQUESTS = (
     Request(
         "track status",
         "show the track, and offsets found by hand-offs",
-        lambda client, _: client.track(),
+        "GET /track",
         keys=TRACK,
     ),
     Request(
         "panorama list",
         "list a daemon's panoramas, the newest first",
-        lambda client, _: {"panoramas": client.panoramas()},
+        "GET /panoramas",
     ),
     Request(
         "panorama delete",
         "delete a panorama of a daemon with its pictures",
-        lambda client, args: {"panoramas": client.delete_panorama(args.id)},
+        "DELETE /panoramas/{id}",
         (option("ID", "as 'mastctl panorama list' shows it", dest="id"),),
         "20260101-120000-1a2b",
     ),
     Request(
         "panorama forget",
         "forget a target",
-        lambda client, args: {"targets": client.forget_target(args.name)},
+        "DELETE /targets/{name}",
         (option("NAME", "of the target"),),
         "outcrop",
     ),
-    Request("track stop", "end the track", lambda client, _: client.stop_track(), keys=TRACK),
+    Request("track stop", "end the track", "POST /track/stop", keys=TRACK),
 )  # fmt: skip
 
 for _one in REQUESTS:
@@ -271,8 +284,7 @@ def _tokens(args: argparse.Namespace) -> TokenList:
         raise output.unusable(str(folder), missing)
     owner = folder.stat().st_uid
     if owner != os.geteuid():  # what root writes there the daemon could not read
-        user = output.user_name(owner)
-        message = f"{folder} belongs to {user}, whose daemon reads it: sudo -u {user} mastctl rig token ..."
+        message = f"{folder} belongs to user {owner}: sudo -u '#{owner}' mastctl rig token ..."
         raise CommandError("another_user", message)
     return TokenList(folder)
 
@@ -283,7 +295,7 @@ def _folder_of_running(args: argparse.Namespace) -> Path:
 
     with client_of(args) as client:
         try:
-            folder = client.live().get("token_folder")
+            folder = client.request("GET", "/health/live").get("token_folder")
         except ClientError as error:
             if error.code != "no_daemon":
                 raise
@@ -296,3 +308,114 @@ def _folder_of_running(args: argparse.Namespace) -> Path:
         message = f"the daemon at {client.url} requires no token, or is on another machine: make it there"
         raise CommandError("no_tokens", message)
     return Path(folder)
+
+
+FOLDER = option("--folder DIR", "the folder of references and results", required=True)
+
+
+def _pose(text: str) -> tuple[float, float]:
+    angles = text.split(",")
+    if len(angles) != 2:
+        raise argparse.ArgumentTypeError(f"'{text}' where PAN,TILT in radians is expected")
+    return angle_rad(angles[0]), angle_rad(angles[1])
+
+
+@contextmanager
+def _steering(args: argparse.Namespace, client: Client) -> Iterator[None]:
+    """Steer alone: under the lease that was named, or one of its own."""
+    if args.lease is not None:
+        yield
+        return
+    with client.lease("sentinel", for_s=120.0, ends_with_stop=True):
+        yield
+
+
+@command(
+    "rig sentinel reference",
+    option("--pose PAN,TILT", "a pose, radians (default: six)", type=_pose, repeat=True),
+    FOLDER,
+    *DAEMON,
+    help="take the reference pictures",
+    example="--folder sentinel --pose 0,-0.3",
+)
+def _reference(args: argparse.Namespace) -> Answer:
+    from mastctl.watch.looks import head_cameras, take_pictures, usual_rests
+    from mastctl.watch.sentinel import now_utc, save_reference
+
+    with client_of(args) as client, _steering(args, client):
+        rests = args.pose or usual_rests(client)
+        _, cameras = head_cameras(client)
+        if not cameras:
+            raise CommandError("no_camera", "the daemon has no camera on the head")
+        with output.waiting(args.json, f"taking images at {len(rests)} poses"):
+            pictures, missing = take_pictures(client, rests, cameras)
+    if missing:
+        which, why = next(iter(missing.items()))
+        raise CommandError("no_picture", f"no reference was taken: {which}: {why}")
+    saved = save_reference(args.folder, now_utc(), rests, pictures)
+    document = {
+        "folder": str(args.folder), "pictures": len(saved.pictures), "rests": [list(rest) for rest in rests]
+    }  # fmt: skip
+    return Answer(document)
+
+
+@command(
+    "rig sentinel look",
+    FOLDER,
+    *DAEMON,
+    help="take them again and report changes; 1 if there is one",
+    example="--folder sentinel",
+)
+def _look(args: argparse.Namespace) -> Answer:
+    from mastctl.watch.looks import look_again
+    from mastctl.watch.sentinel import add_look, read_reference
+
+    reference = read_reference(args.folder)
+    with (
+        client_of(args) as client,
+        _steering(args, client),
+        output.waiting(args.json, f"comparing {len(reference.rests)} poses"),
+    ):
+        drift = look_again(client, reference)
+    return _standing(args, add_look(args.folder, reference, drift))
+
+
+def _standing(args: argparse.Namespace, look: dict[str, Any] | None) -> Answer:
+    from mastctl.watch.sentinel import read_looks, read_reference, standing
+
+    reference = read_reference(args.folder)
+    now = standing(reference, read_looks(args.folder, reference))
+    document = {name: now[name] for name in ("level", "sentence", "since", "looks")} | {"look": look}
+    missing = [f"{which}: no picture: {why}" for which, why in (look or {}).get("missing", {}).items()]
+    return Answer(document, [now["sentence"], *missing], 1 if now["level"] == "bad" else 0)
+
+
+@command(
+    "rig sentinel watch",
+    option(
+        "--every-s S", "how often, from the reference's time of day on (default: once a day)", default=86400.0
+    ),
+    option("--idle-s S", "how long the head must have been idle", default=300.0),
+    FOLDER,
+    *DAEMON,
+    help="look again and again, whenever the head is idle, until Ctrl-C",
+    example="--folder sentinel --every-s 86400",
+)
+def _watch(args: argparse.Namespace) -> int:
+    from mastctl.watch.looks import watch
+
+    def report(look: dict[str, Any]) -> None:
+        output.show(args, _standing(args, look))
+
+    watch(args.folder, lambda: client_of(args), output.tell, report, args.every_s, args.idle_s)
+    return 0
+
+
+@command(
+    "rig sentinel status",
+    FOLDER,
+    help="the result of the looks so far; 1 if something has changed",
+    example="--folder sentinel",
+)
+def _status(args: argparse.Namespace) -> Answer:
+    return _standing(args, None)

@@ -1,9 +1,11 @@
-"""Commands of the service: the daemon itself, what it knows and does, and a picture of it."""
+"""The daemon itself, what it knows and does, a picture of it, and its adapter to ROS 2."""
 
 from __future__ import annotations
 
 import argparse
 import logging
+import os
+import re
 import signal
 import time
 from collections.abc import Iterable, Mapping
@@ -13,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from mastctl import signals
 from mastctl.cli import output
-from mastctl.cli.daemon import DAEMON, client_of, followed, queue_output
+from mastctl.cli.daemon import CONFIG, DAEMON, URL, client_of, followed, queue_output
 from mastctl.cli.options import command, one_of, option
 from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, cell, chosen, tables_at
 from mastctl.logs import QueuedHandler
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from mastctl.config import Config, Listen
 
 POLL_S = 0.1  # how often `status --wait` requests the status
+ROS_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 
 STATUS = (
@@ -209,3 +212,43 @@ def _snapshot(args: argparse.Namespace) -> Answer:
     out.write_bytes(data)
     facts = chosen(shot.facts, "frame_id pan_rad tilt_rad moving")
     return Answer({"file": str(out), **shot.facts}, f"{out}: {cell(facts)}")
+
+
+@command(
+    "ros2",
+    URL,
+    CONFIG,
+    option("--prefix WORD", "stands before joints and frames", default=""),
+    option("--base FRAME", "the rover's frame with the axes of ROS", default="base_link"),
+    option(
+        "--ros-args ...",
+        "remappings and parameters of ROS: -r, -p, ...",
+        nargs=argparse.REMAINDER,
+        metavar="...",
+        default=[],
+    ),
+    example="--url http://127.0.0.1:8420",
+    about="Publishes joints, transforms, images, diagnostics and residuals of a running daemon, "
+    "and takes trajectories, points and stops for it. Needs rclpy (ROS 2 Jazzy or Kilted).",
+)
+def _ros2(args: argparse.Namespace) -> int:
+    from mastctl.client import Client
+    from mastctl.ros2.adapter import check_ros, run
+
+    for name, text in (("--prefix", args.prefix), ("--base", args.base)):
+        if not ROS_NAME.fullmatch(text) and (name == "--base" or text):
+            raise WrongUse(f"{name} is '{text}' where a word of letters, digits and _ is expected")
+    check_ros()
+    with client_of(args) as client:
+        url = client.url
+    client_name = f"ros2@{os.uname().nodename}:{os.getpid()}"
+    queue_output()
+    with suppress(KeyboardInterrupt), signals.raised():
+        run(
+            lambda: Client(url, timeout_s=10.0, name=client_name),
+            args.prefix,
+            args.base,
+            args.ros_args,
+            lambda node: output.show(args, Answer({"node": node, "url": url}, f"{node} is a node of {url}")),
+        )
+    return 0

@@ -11,7 +11,7 @@ from mastctl.cli.daemon import DAEMON, TIMEOUT, client_of, followed
 from mastctl.cli.options import angle_rad, command, finite_number, one_of, option
 from mastctl.cli.output import Answer, CommandError, WrongUse, cell, chosen
 from mastctl.cli.requests import TRACK
-from mastctl.cli.service import operation_shown, show_each
+from mastctl.cli.service import operation_shown
 
 if TYPE_CHECKING:
     from mastctl.answers import OperationAnswer, TrackAnswer
@@ -175,18 +175,6 @@ def _start(args: argparse.Namespace) -> Answer:
         operation_id = client.start_track(**_target(args, client))
         _done(args, client, operation_id)
         return _track(client.wait_track(operation_id, args.timeout))
-
-
-@command(
-    "track watch",
-    option("--count N", "end after so many (default: never)"),
-    *DAEMON,
-    help="show the track now and at each change, a line each; --json: a document a line",
-    example="--count 10",
-)
-def _watch(args: argparse.Namespace) -> int:
-    with client_of(args) as client:
-        return show_each(args, map(_track, client.watch_track()))
 
 
 @command(

@@ -10,8 +10,8 @@ from mastctl.client.connection import DaemonHttp, escaped, given
 
 
 class Calls:
-    """Configuration, mast files, recordings, places, benches, panoramas, targets; of a simulated rover its
-    true pose, boards, time and faults.
+    """Configuration, mast files, recordings, benches, panoramas, targets; of a simulated rover its true pose,
+    boards, time and faults.
     """
 
     daemon: DaemonHttp
@@ -22,59 +22,25 @@ class Calls:
         """
         return self.daemon.command(answers.ReloadResult, "POST", "/reload")
 
-    def live(self) -> answers.LiveAnswer:
-        """Return that the daemon answers; needs no token."""
-        return self.daemon.json(answers.LiveAnswer, "GET", "/health/live")
-
-    def calibration_health(self) -> answers.CalibrationReport:
-        """Return whether residuals of the last days are as the mast file predicts, with the figures."""
-        return self.daemon.json(answers.CalibrationReport, "GET", "/calibration/health")
-
-    def sentinel(self) -> answers.SentinelAnswer:
-        """Return what the drift sentinel in the daemon's state folder has found, and how long ago."""
-        return self.daemon.json(answers.SentinelAnswer, "GET", "/sentinel")
-
-    def rig(self) -> answers.RigSummary:
-        """Return the configured cameras by the mast file in use: the direction and the field of each."""
-        return self.daemon.json(answers.RigSummary, "GET", "/rig")
-
     def camera_settings(self, camera: str) -> answers.CameraSettingsAnswer:
         """Return what of a camera can be changed: ``settings`` with bounds, and whether they are ``held``."""
         return self.daemon.json(answers.CameraSettingsAnswer, "GET", f"/cameras/{escaped(camera)}/settings")
 
-    def set_camera(
-        self,
-        camera: str,
-        *,
-        exposure_s: float | None = None,
-        gain: float | None = None,
-        white_balance_k: float | None = None,
-        focus: float | None = None,
-    ) -> answers.CameraSettingsAnswer:
-        """Change some of a camera's settings and return all as they are then.
+    def set_camera(self, camera: str, **settings: float) -> answers.CameraSettingsAnswer:
+        """Change ``exposure_s``, ``gain``, ``white_balance_k``, ``focus`` of a camera, and return all.
 
         The automatic of each is turned off. ``notes`` has a sentence for each that became another value. They
         hold until the daemon ends, also for a camera that is unplugged meanwhile. Each picture's
         facts have those that it was taken with.
         """
-        body = given(exposure_s=exposure_s, gain=gain, white_balance_k=white_balance_k, focus=focus)
         path = f"/cameras/{escaped(camera)}/settings"
-        return self.daemon.command(answers.CameraSettingsAnswer, "PATCH", path, body)
+        return self.daemon.command(answers.CameraSettingsAnswer, "PATCH", path, given(**settings))
 
     def bench(self) -> answers.BenchRuns:
         """Return the bench calibration at work or the last one (``run``), and those that are kept."""
         return self.daemon.json(answers.BenchRuns, "GET", "/bench")
 
-    def begin_bench(
-        self,
-        board: str | None = None,
-        *,
-        board_file: str | None = None,
-        resume: str | None = None,
-        wanted_px: float | None = None,
-        pictures: int | None = None,
-        by_hand: bool | None = None,
-    ) -> answers.BenchRunRecord:
+    def begin_bench(self, board: str | None = None, **wanted: Any) -> answers.BenchRunRecord:
         """Have the daemon begin a bench calibration, or go on with one, and return it as it is then.
 
         ``board`` names a packaged one, ``board_file`` is the text of a BOARD.yaml, ``resume`` names a run:
@@ -82,14 +48,7 @@ class Calls:
         pointing, rms an axis (by default 0.2), ``pictures`` the most of each camera (60). ``by_hand``: a
         simulated board waits for `board_stands` too, as a real one does.
         """
-        body = given(
-            board=board,
-            board_file=board_file,
-            resume=resume,
-            wanted_px=wanted_px,
-            pictures=pictures,
-            by_hand=by_hand,
-        )
+        body = given(board=board, **wanted)
         return self.daemon.command(answers.BenchAnswer, "POST", "/bench", body)["run"]
 
     def board_stands(self) -> answers.BenchRunRecord:
@@ -100,20 +59,9 @@ class Calls:
         """End the bench calibration; it can go on later (`begin_bench`, ``resume``)."""
         return self.daemon.command(answers.BenchAnswer, "POST", "/bench/leave")["run"]
 
-    def forget_bench(self, name: str) -> answers.BenchRuns:
-        """Remove a bench calibration that is over, with its pictures and report; its mast file stays.
-
-        Returns what is left, as `bench`. Refused with ``bench_runs``, ``bench_unknown``, ``unwritable``.
-        """
-        return self.daemon.command(answers.BenchRuns, "DELETE", f"/bench/runs/{escaped(name)}")
-
     def report(self, name: str) -> bytes:
         """Return the report of a bench calibration, HTML."""
         return self.daemon.request("GET", f"/reports/{escaped(name)}").content
-
-    def recordings(self) -> answers.Recordings:
-        """Return the daemon's recordings, and what it records now."""
-        return self.daemon.json(answers.Recordings, "GET", "/recordings")
 
     def start_recording(self, name: str = "") -> answers.RecorderState:
         """Have the daemon record until `stop_recording`; return what it records then."""
@@ -123,15 +71,6 @@ class Calls:
         """End the recording; return its file on the daemon's machine, its size and what was dropped."""
         return self.daemon.command(answers.RecordingEnded, "POST", "/recordings/stop")
 
-    def recording(self, name: str, file: str) -> bytes:
-        """Return a file of a recording whole, by the names that `recordings` returns."""
-        path = f"/recordings/{escaped(name)}/{escaped(file)}"
-        return self.daemon.request("GET", path).content
-
-    def delete_recording(self, name: str) -> answers.RecordingDeleted:
-        """Delete a run, or what was kept at a fault; return what is left."""
-        return self.daemon.command(answers.RecordingDeleted, "DELETE", f"/recordings/{escaped(name)}")
-
     def mast_file(self) -> bytes:
         """Return the mast file that the daemon uses, byte for byte."""
         return self.daemon.request("GET", "/mast").content
@@ -140,96 +79,18 @@ class Calls:
         """Use another mast file of the same folder; return which is in use now, and the former one."""
         return self.daemon.command(answers.MastChange, "POST", "/mast", {"file": file})
 
-    def use_former_mast(self) -> answers.MastChange:
-        """Go back to the mast file that was in use before; return which is in use now, and the former one."""
-        return self.daemon.command(answers.MastChange, "POST", "/mast/back")
-
-    def places(self) -> dict[str, answers.HeadPlace]:
-        """Return the places of the head that are kept, by name; ``home`` is always among them."""
-        return self.daemon.json(answers.PlaceList, "GET", "/places")["places"]
-
-    def keep_place(self, name: str, pan_rad: float, tilt_rad: float) -> dict[str, answers.HeadPlace]:
-        """Keep a place of the head by a name, for all clients; return all."""
-        body = {"pan_rad": pan_rad, "tilt_rad": tilt_rad}
-        return self.daemon.command(answers.PlaceList, "POST", f"/places/{escaped(name)}", body)["places"]
-
-    def forget_place(self, name: str) -> dict[str, answers.HeadPlace]:
-        """Forget a place; return those that are left. Raises ClientError ``place_unknown``."""
-        return self.daemon.command(answers.PlaceList, "DELETE", f"/places/{escaped(name)}")["places"]
-
-    def sun(self) -> answers.SunAnswer:
-        """Return the direction that no head camera looks into: ``sun``, null where none was stated."""
-        return self.daemon.json(answers.SunAnswer, "GET", "/limits/sun")
-
-    def keep_off_sun(
-        self,
-        azimuth_rad: float,
-        elevation_rad: float,
-        half_angle_rad: float,
-        *,
-        frame: Literal["site", "rover"] = "site",
-        valid_s: float | None = None,
-    ) -> answers.SunAnswer:
-        """Say where the sun stands: azimuth from north over east (forward over right), elevation up.
-
-        ``half_angle_rad``: how near a head camera's axis may come; ``valid_s``: how long that holds, seconds,
-        by default until another is stated.
-        """
-        body = given(
-            azimuth_rad=azimuth_rad,
-            elevation_rad=elevation_rad,
-            half_angle_rad=half_angle_rad,
-            frame=frame,
-            valid_s=valid_s,
-        )
-        return self.daemon.command(answers.SunAnswer, "POST", "/limits/sun", body)
-
-    def forget_sun(self) -> answers.SunAnswer:
-        """Keep the head off no sun any more."""
-        return self.daemon.command(answers.SunAnswer, "DELETE", "/limits/sun")
-
-    def session(self) -> answers.ClientSession:
-        """Return this client's ``name``, ``role`` and ``via``, and whether the daemon requires a token."""
-        return self.daemon.json(answers.ClientSession, "GET", "/session")
-
-    def take_panorama(
-        self,
-        *,
-        pair: str | None = None,
-        camera: str | None = None,
-        pan_rad: Sequence[float] | None = None,
-        tilt_rad: Sequence[float] | None = None,
-        overlap: float | None = None,
-        exposure: Literal["first", "auto-per-view"] | None = None,
-        resume: str | None = None,
-    ) -> str:
+    def take_panorama(self, **wanted: Any) -> str:
         """Start to take a panorama and return the operation's id; its record names the panorama.
 
-        ``pan_rad``, ``tilt_rad``: azimuth and elevation of the field, from and to. ``resume`` names one of
-        which views are missing, and goes alone.
+        ``pair`` or ``camera``; ``pan_rad``, ``tilt_rad``: azimuth and elevation of the field, from and to;
+        ``overlap``; ``exposure``: ``first`` or ``auto-per-view``. ``resume`` names one of which views are
+        missing, and goes alone.
         """
-        body = given(
-            pair=pair,
-            camera=camera,
-            pan_rad=pan_rad,
-            tilt_rad=tilt_rad,
-            overlap=overlap,
-            exposure=exposure,
-            resume=resume,
-        )
-        return self.daemon.command(answers.Started, "POST", "/panoramas", body)["id"]
-
-    def panoramas(self) -> list[answers.PanoramaListed]:
-        """Return the daemon's panoramas, the newest first."""
-        return self.daemon.json(answers.PanoramaList, "GET", "/panoramas")["panoramas"]
+        return self.daemon.command(answers.Started, "POST", "/panoramas", given(**wanted))["id"]
 
     def panorama(self, name: str) -> dict[str, Any]:
         """Return a panorama's index (``mastctl/panorama/1``)."""
         return self.daemon.json(dict[str, Any], "GET", f"/panoramas/{escaped(name)}")
-
-    def delete_panorama(self, name: str) -> list[answers.PanoramaListed]:
-        """Delete a panorama with its pictures and return those that are left."""
-        return self.daemon.command(answers.PanoramaList, "DELETE", f"/panoramas/{escaped(name)}")["panoramas"]
 
     def panorama_file(self, name: str, file: str) -> bytes:
         """Return a file of a panorama: ``index.yaml``, ``mosaic.png``, a frame that the index names."""
@@ -249,10 +110,6 @@ class Calls:
         """Keep a point by a name, for all clients, in the site frame if a pose is known; return all."""
         body = given(position_m=position_m, frame=frame, covariance_m2=covariance_m2)
         return self.daemon.command(answers.TargetList, "POST", f"/targets/{escaped(name)}", body)["targets"]
-
-    def forget_target(self, name: str) -> dict[str, answers.KeptTarget]:
-        """Forget a target; return those that are left. Raises ClientError ``target_unknown``."""
-        return self.daemon.command(answers.TargetList, "DELETE", f"/targets/{escaped(name)}")["targets"]
 
     def true_pose(self) -> answers.TruePose:
         """Return where a simulated rover truly stands: ``position_m`` and ``quaternion``, site_from_rover."""
@@ -277,9 +134,7 @@ class Calls:
         name: str,
         position_m: Sequence[float],
         board: Mapping[str, Any] | None = None,
-        turned_rad: Sequence[float] | None = None,
-        quaternion: Sequence[float] | None = None,
-        bow_m: Sequence[float] | None = None,
+        **more: Sequence[float] | None,
     ) -> answers.BoardPose:
         """Hold a board up before a simulated rover, or move it; frames exposed from now on show it there.
 
@@ -289,13 +144,7 @@ class Calls:
         nearer, clockwise), or ``quaternion``: rover_from_board (w, x, y, z). ``bow_m``: how far its middle
         stands out, across and down; by default as before, flat at first.
         """
-        body = given(
-            position_m=position_m,
-            board=board,
-            turned_rad=turned_rad,
-            quaternion=quaternion,
-            bow_m=bow_m,
-        )
+        body = given(position_m=position_m, board=board, **more)
         return self.daemon.command(answers.BoardPose, "POST", f"/simulation/boards/{escaped(name)}", body)
 
     def take_board(self, name: str) -> None:
@@ -332,10 +181,6 @@ class Calls:
         x_m, y_m, z_m = (None, None, None) if position_in_site_m is None else position_in_site_m
         query = given(frame_id=frame_id, x_px=x_px, y_px=y_px, x_m=x_m, y_m=y_m, z_m=z_m)
         return self.daemon.json(answers.PointTruth, "GET", "/simulation/truth", params=query)
-
-    def fault_words(self) -> dict[str, dict[str, answers.FaultKind]]:
-        """Return the fault words of each simulated device: each one's ``effect``, and its ``parameters``."""
-        return self.daemon.json(answers.FaultKinds, "GET", "/simulation/words")["devices"]
 
     def faults(self) -> list[answers.FaultSet]:
         """Return the faults that are switched on in a simulated rover."""

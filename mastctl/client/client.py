@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 from mastctl import answers
 from mastctl.client.calls import Calls
-from mastctl.client.connection import PASSING, ClientError, DaemonHttp, escaped, followed, given
-from mastctl.client.jog import ANSWER_S, Jog
-from mastctl.client.lease import LeaseCalls
+from mastctl.client.connection import PASSING, ClientError, DaemonHttp, escaped, given, polled
+from mastctl.client.steering import ANSWER_S, Jog, LeaseCalls
 from mastctl.frame_facts import FrameFacts, facts_in
 
 if TYPE_CHECKING:
@@ -77,12 +76,9 @@ class Client(LeaseCalls, Calls):
     token
         Expected by a daemon from other machines; by default ``$MASTCTL_TOKEN``. Others can read it on the way
         without TLS. The file ``$MASTCTL_CA_FILE`` may name further certificates.
-    reads_only
-        Why this client sends no command (``reads_only``, one sentence); empty if it does.
 
     Where the connection breaks, the client sends a command again; its key lets the daemon execute it once.
-    Every method raises ClientError for whatever goes wrong. ``daemon`` is the connection, for a request that
-    no method sends.
+    Every method raises ClientError for whatever goes wrong.
     """
 
     def __init__(
@@ -91,11 +87,18 @@ class Client(LeaseCalls, Calls):
         timeout_s: float = 30.0,
         name: str | None = None,
         token: str | None = None,
-        reads_only: str = "",
     ) -> None:
         self.url = url
-        self.reads_only = reads_only
-        self.daemon = DaemonHttp(url, timeout_s, name, token, reads_only)
+        self.daemon = DaemonHttp(url, timeout_s, name, token)
+
+    def request(self, method: str, path: str, **body: Any) -> dict[str, Any]:
+        """Send a request that no other method sends, as ``request("POST", "/mast/back")``; return the answer.
+
+        The reference of the HTTP interface has paths and bodies; the query of GET goes into ``body`` too.
+        """
+        if method == "GET":
+            return self.daemon.json(dict[str, Any], method, path, params=given(**body))
+        return self.daemon.command(dict[str, Any], method, path, given(**body) or None)
 
     def status(self, timeout_s: float | None = None) -> answers.Status:
         """Return what the daemon knows now; ``timeout_s`` shortens the longest time of this request.
@@ -196,11 +199,9 @@ class Client(LeaseCalls, Calls):
         body = _target(pixel, None, None, aim, range_m, plane)
         return self.daemon.json(answers.Preview, "POST", "/point/preview", json=body)
 
-    def operation(self, operation_id: str, timeout_s: float | None = None) -> answers.OperationAnswer:
-        """Return an operation's record; ``timeout_s`` as of `status`."""
-        return self.daemon.json(
-            answers.OperationAnswer, "GET", f"/operations/{escaped(operation_id)}", within_s=timeout_s
-        )
+    def operation(self, operation_id: str) -> answers.OperationAnswer:
+        """Return an operation's record."""
+        return self.daemon.json(answers.OperationAnswer, "GET", f"/operations/{escaped(operation_id)}")
 
     def operations(self) -> list[answers.OperationListed]:
         """Return the newest operations, newest first, without their steps."""
@@ -225,9 +226,9 @@ class Client(LeaseCalls, Calls):
         in time; it goes on.
         """
         seen = 0
-        query = {"topics": "operation", "key": operation_id}
-        for record in followed(
-            self.daemon, query, lambda within_s: self.operation(operation_id, within_s), timeout_s
+        path = f"/operations/{escaped(operation_id)}"
+        for record in polled(
+            lambda within_s: self.daemon.json(answers.OperationAnswer, "GET", path, within_s), timeout_s
         ):
             for step in record["steps"][seen:]:
                 seen += 1
@@ -237,35 +238,13 @@ class Client(LeaseCalls, Calls):
                 return record
         raise ClientError("timeout", f"operation {operation_id} has not ended after {timeout_s:g} s")
 
-    def wait_state(
-        self,
-        *states: str,
-        timeout_s: float = 60.0,
-        on_change: Callable[[answers.Status | answers.StateAnswer], None] | None = None,
-    ) -> answers.Status | answers.StateAnswer:
-        """Wait until the daemon's state is one of these; return it with what goes with it in the status.
-
-        ``on_change`` is called with the same at the beginning and at each change. Raises ClientError
-        ``timeout``.
-        """
-        state = ""
-        for now in followed(self.daemon, {"topics": "state"}, self.status, timeout_s):
-            state = now["state"]
-            if on_change is not None:
-                on_change(now)
-            if state in states:
-                return now
-        wanted = " or ".join(states)
-        raise ClientError("timeout", f"the state is {state} and not {wanted} after {timeout_s:g} s")
-
     def events(self, *topics: str, keys: Sequence[str] = ()) -> Generator[answers.Event, None, None]:
         """Yield each change of some topics (all without any) and keys, beginning with what is known, until
         the daemon ends: ``topic``, ``key``, ``sequence``, ``lost``, ``value``.
         """
         query = given(key=list(keys) or None, topics=",".join(topics) or None)
-        for event in self.daemon.heard("/events", query):
-            if event is not None:
-                yield cast(answers.Event, event)
+        for event in self.daemon.events(query):
+            yield cast(answers.Event, event)
 
     def stop(self) -> answers.StopAnswer:
         """Stop the mast and the running operation."""
@@ -307,9 +286,9 @@ class Client(LeaseCalls, Calls):
         )
         return self.daemon.json(answers.PoseTaken, "POST", "/pose", json=body)
 
-    def track(self, timeout_s: float | None = None) -> answers.TrackAnswer:
-        """Return the track as it is; ``timeout_s`` as of `status`."""
-        return self.daemon.json(answers.TrackAnswer, "GET", "/track", within_s=timeout_s)
+    def track(self) -> answers.TrackAnswer:
+        """Return the track as it is."""
+        return self.daemon.json(answers.TrackAnswer, "GET", "/track")
 
     def start_track(
         self,
@@ -339,16 +318,12 @@ class Client(LeaseCalls, Calls):
         """
         if operation_id is not None:
             self.wait(operation_id, timeout_s, on_step)
-        for track in followed(self.daemon, {"topics": "track"}, self.track, timeout_s):
+        for track in polled(
+            lambda within_s: self.daemon.json(answers.TrackAnswer, "GET", "/track", within_s), timeout_s
+        ):
             if operation_id is None or track["operation"] != operation_id:
                 return track
         raise ClientError("timeout", f"the track did not take up operation {operation_id}")
-
-    def watch_track(self) -> Generator[answers.TrackAnswer, None, None]:
-        """Yield the track as it is, and again at each change, until the daemon ends."""
-        for track in self.daemon.heard("/track/stream"):
-            if track is not None:
-                yield cast(answers.TrackAnswer, track)
 
     def stop_track(self) -> answers.TrackAnswer:
         """End the track; return it as it is then."""

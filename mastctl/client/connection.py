@@ -22,12 +22,10 @@ T = TypeVar("T")
 
 PREFIX = "/api/v1"
 AGAIN_S = (0.1, 0.5)  # pauses before a command goes out again on a new connection
-STREAM_AGAIN_S = (0.1, 0.5, 1.0)  # pauses before a stream that broke is begun again
-SILENT_S = 10.0  # the daemon shows every 2 s that it is there
-LAST_S = 3.0  # of a wait: then it ends to the moment, and not with the next sign of life
+POLL_AGAIN_S = (0.1, 0.5, 1.0)  # pauses of a wait in which the daemon does not answer any more
 PASSING = ("no_daemon", "timeout", "closing")
 LEAST_S = 1.0  # for a request, on a machine that is busy
-POLL_S = 0.25  # between requests to a daemon that has no stream left
+POLL_S = 0.05  # between the requests of a wait
 _BAD_INPUT = frozenset({400, 404, 413, 415, 422})
 
 
@@ -76,10 +74,8 @@ class DaemonHttp:
         timeout_s: float,
         name: str | None = None,
         token: str | None = None,
-        reads_only: str = "",
     ) -> None:
         self.url = url
-        self._reads_only = reads_only
         self._token = token or os.environ.get("MASTCTL_TOKEN")
         if self._token and not (self._token.isascii() and self._token.isprintable()):
             raise ClientError("bad_token", "the token has characters that no token has", exit_code=2)
@@ -90,7 +86,7 @@ class DaemonHttp:
 
     def beside(self, timeout_s: float) -> DaemonHttp:
         """Return another connection of the same program, under the same lease, for a thread of its own."""
-        other = DaemonHttp(self.url, timeout_s, self.name, self._token, self._reads_only)
+        other = DaemonHttp(self.url, timeout_s, self.name, self._token)
         other.lease_id = self.lease_id
         return other
 
@@ -149,27 +145,19 @@ class DaemonHttp:
 
     def send(self, method: str, path: str, **options: Any) -> httpx.Response:
         """Send a request for a path of the whole address, and return the answer whatever it is."""
-        if self._reads_only and method != "GET":
-            raise ClientError("reads_only", self._reads_only)
         with self._failures(f"the daemon at {self.url} took the request but did not answer"):
             return self._http.request(method, path, **options)
 
-    def heard(
-        self, path: str, query: Mapping[str, Any] | None = None, silent_s: float | None = None
-    ) -> Generator[dict[str, Any] | None, None, None]:
-        """Yield a stream's messages, and None for each sign of life, until the daemon ends.
-
-        ``timeout`` is raised if it is silent for ``silent_s`` seconds, those of each request by default.
-        """
+    def events(self, query: Mapping[str, Any]) -> Generator[dict[str, Any], None, None]:
+        """Yield the events of the daemon's stream until it ends; ``timeout`` is raised if it falls silent."""
         with self._failures(f"the daemon at {self.url} fell silent"):
-            waits_s = silent_s or self.timeout_s
-            request = self._http.build_request("GET", PREFIX + path, params=query, timeout=waits_s)
+            request = self._http.build_request("GET", f"{PREFIX}/events", params=query)
             with closing(self._http.send(request, stream=True)) as answer:
                 if not answer.is_success:
                     answer.read()
                     raise self._refused(answer)
                 for line in answer.iter_lines():
-                    if line.startswith((":", "data:")):
+                    if line.startswith("data:"):
                         yield self._event(line)
 
     def bad_answer(self, reason: str) -> ClientError:
@@ -195,10 +183,7 @@ class DaemonHttp:
             )
         return ClientError(code, message, detail if isinstance(detail, dict) else None, exit_code)
 
-    def _event(self, line: str) -> dict[str, Any] | None:
-        """The event of a stream's line, None for a sign of life."""
-        if line.startswith(":"):
-            return None
+    def _event(self, line: str) -> dict[str, Any]:
         try:
             return dict(json.loads(line.removeprefix("data:")))
         except (ValueError, TypeError, RecursionError):
@@ -264,58 +249,28 @@ class DaemonHttp:
         self._http.close()
 
 
-def followed(
-    daemon: DaemonHttp,
-    query: Mapping[str, Any],
-    request: Callable[[float], T],
-    timeout_s: float,
-) -> Generator[T, None, None]:
-    """Yield a value as it is, then at each change, for some seconds.
+def polled(request: Callable[[float], T], timeout_s: float) -> Iterator[T]:
+    """Yield a value again and again, for some seconds.
 
-    The value is requested before each stream, and each stream begins with what is known, so that no end of
-    anything is missed. A stream that breaks is begun again; where the daemon has none left, it is polled.
-
-    ``query`` selects events of one topic and key. ``request`` returns the value by a request of its own that
-    may take so many seconds; its ClientError passes: ``no_daemon`` if the daemon is gone,
-    ``operation_unknown`` if it is another one.
+    ``request`` returns it by a request that may take so many seconds. Its ClientError passes:
+    ``operation_unknown`` if the daemon is another one, ``no_daemon`` if it is gone for longer than a
+    connection takes to come back.
     """
     until_s = time.monotonic() + timeout_s
     pauses: list[float] = []  # a daemon that does not answer at the beginning is reported at once
     while True:
         try:
             yield request(max(until_s - time.monotonic(), LEAST_S))
-            pauses = pauses or list(STREAM_AGAIN_S)  # it answers
-            with closing(_stream(daemon, query, until_s)) as values:
-                for value in values:
-                    pauses = list(STREAM_AGAIN_S)
-                    yield cast(T, value)
+            pauses = list(POLL_AGAIN_S)
+            pause_s = POLL_S
         except ClientError as error:
-            if error.code == "too_many":
-                pauses = [POLL_S, *STREAM_AGAIN_S]
-            elif not (isinstance(error, Broken) or error.code in PASSING):
+            if error.code not in PASSING or not pauses:
                 raise
-            if not pauses:
-                raise
-            time.sleep(max(0.0, min(pauses.pop(0), until_s - time.monotonic())))
-        if time.monotonic() >= until_s:
+            pause_s = pauses.pop(0)
+        left_s = until_s - time.monotonic()
+        if left_s <= 0.0:
             return
-
-
-def _stream(
-    daemon: DaemonHttp, query: Mapping[str, Any], until_s: float
-) -> Generator[dict[str, Any], None, None]:
-    """Yield a stream's values until it ends, or a time, or some seconds before it."""
-    left_s = until_s - time.monotonic()
-    if left_s <= 0:
-        return
-    last = left_s <= LAST_S
-    with closing(daemon.heard("/events", query, min(left_s, SILENT_S))) as events:
-        for event in events:
-            if event is not None:
-                yield event["value"]
-            left_s = until_s - time.monotonic()
-            if left_s <= (0.0 if last else LAST_S):
-                return
+        time.sleep(min(pause_s, left_s))
 
 
 def given(**values: Any) -> dict[str, Any]:

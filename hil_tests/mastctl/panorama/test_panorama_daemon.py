@@ -96,6 +96,10 @@ def preview(client: Client, index: dict[str, Any], **more: Any) -> Any:
     return client.daemon.json(dict, "POST", "/point/preview", json=body)
 
 
+def listed(client: Client) -> Any:
+    return client.request("GET", "/panoramas")["panoramas"]
+
+
 def refused(code: str, act: Any) -> str:
     with pytest.raises(ClientError) as refusal:
         act()
@@ -148,7 +152,7 @@ def test_head_and_targets_are_drawn_where_they_are_seen(client: Client, panorama
     seen: Any = client.daemon.json(dict, "POST", "/point/preview", json={"panorama": target})
     client.keep_target("rock", seen["position_m"])
     shown: Any = client.daemon.json(dict, "GET", f"/panoramas/{panorama['id']}/drawing")
-    client.forget_target("rock")
+    client.request("DELETE", "/targets/rock")
     assert shown["size_px"] == mosaic["size_px"]
     np.testing.assert_allclose(shown["targets_px"]["rock"], [target["x_px"], target["y_px"]], atol=0.5)
     middle = (np.min(shown["view_px"], axis=0) + np.max(shown["view_px"], axis=0)) / 2.0
@@ -186,7 +190,7 @@ def test_another_mast_file_is_refused_by_name_or_recomputed(
         pixel = record["request"]["pixel"]
         np.testing.assert_allclose([pixel["x_px"], pixel["y_px"]], clicked, atol=1e-6)
     finally:
-        client.use_former_mast()
+        client.request("POST", "/mast/back")
 
 
 def test_views_beyond_the_limits_are_left_out_and_listed(client: Client) -> None:
@@ -202,12 +206,12 @@ def test_a_stop_keeps_what_was_taken_and_resume_goes_on(client: Client) -> None:
     operation = client.take_panorama(**FIELD)
     name = str(client.operation(operation)["request"]["panorama"])
     until(lambda: any(one["state"] == "taken" for one in client.panorama(name)["views"]), "a view")
-    before_ids = [one["id"] for one in client.panoramas()]
+    before_ids = [one["id"] for one in listed(client)]
     for other in (FIELD, {"resume": name}):
         refused("busy", lambda other=other: client.take_panorama(**other))
-    refused("busy", lambda: client.delete_panorama(name))
-    assert [one["id"] for one in client.panoramas()] == before_ids, "nothing is left of what was refused"
-    assert client.panoramas()[0]["state"] == "running"
+    refused("busy", lambda: client.request("DELETE", f"/panoramas/{name}"))
+    assert [one["id"] for one in listed(client)] == before_ids, "nothing is left of what was refused"
+    assert listed(client)[0]["state"] == "running"
     client.stop()
     record: Any = client.wait(operation, 60.0)
     index = client.panorama(name)
@@ -288,7 +292,7 @@ def test_a_killed_daemons_panorama_goes_on_in_the_next(rover: Path, tmp_path: Pa
     folder.save(folder.index.model_copy(update={"state": "running", "views": views, "mosaic": None}))
     (path / folder.index.views[1].frames["navcam_left"].file).write_bytes(b"no picture")
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
-        assert client.panoramas()[0]["state"] == "ended"
+        assert listed(client)[0]["state"] == "ended"
         assert "not the picture" in refused(
             "unreadable", lambda: client.daemon.request("GET", f"/panoramas/{index['id']}/picture")
         )
@@ -299,8 +303,10 @@ def test_a_killed_daemons_panorama_goes_on_in_the_next(rover: Path, tmp_path: Pa
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
         refused("unknown_camera", lambda: client.take_panorama(resume=index["id"]))
         assert preview(client, index)["range_from"] == "surface"
-        assert client.delete_panorama(index["id"]) == [] and not path.exists()
-        refused("panorama_unknown", lambda: client.delete_panorama(index["id"]))
+        assert (
+            client.request("DELETE", f"/panoramas/{index['id']}") == {"panoramas": []} and not path.exists()
+        )
+        refused("panorama_unknown", lambda: client.request("DELETE", f"/panoramas/{index['id']}"))
 
 
 def test_another_client_takes_the_lease_and_it_ends(client: Client, daemon: RunningDaemon) -> None:
@@ -329,8 +335,8 @@ def test_a_target_is_kept_drawn_and_goes_into_the_site(client: Client, daemon: R
     shown = daemon.service.targets_in(daemon.service.snapshot("navcam_left", True))["rock"]
     assert abs(shown["x_px"] - 199.5) < 3 and abs(shown["y_px"] - 149.5) < 3
     assert shown["major_px"] > shown["minor_px"] > 0.0
-    assert client.forget_target("rock") == {}
-    assert "no target is kept" in refused("target_unknown", lambda: client.forget_target("rock"))
+    assert client.request("DELETE", "/targets/rock") == {"targets": {}}
+    assert "no target is kept" in refused("target_unknown", lambda: client.request("DELETE", "/targets/rock"))
 
 
 def test_the_command_brings_the_folder_shows_composes_exports_and_points(

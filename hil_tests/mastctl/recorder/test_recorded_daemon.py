@@ -127,12 +127,11 @@ def test_a_recording_is_read_and_deleted_by_its_name_only(client: Client, daemon
         ended = client.stop_recording()
         whole = http.get(f"/{run}/{file}", headers={"Range": "bytes=0-9"})
         assert (whole.status_code, whole.content) == (200, Path(ended["file"]).read_bytes())
-        assert client.recording(str(run), str(file)) == whole.content
         for path in ("/nothing", "/..%2Fruns", "/%2E%2E"):
             assert refused("DELETE", path) in ("recording_unknown", "not_found", "method_not_allowed"), path
         assert refused("GET", f"/{run}/..%2F{file}") in ("recording_unknown", "not_found")
         assert Path(ended["file"]).exists()
-        left = client.delete_recording(str(run))["recordings"]
+        left = client.request("DELETE", f"/recordings/{run}")["recordings"]
         assert run not in [one["name"] for one in left] and not Path(ended["file"]).exists()
         assert refused("DELETE", f"/{run}") == "recording_unknown"
 

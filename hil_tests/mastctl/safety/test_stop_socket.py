@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import select
 import socket
 import stat
@@ -16,7 +15,7 @@ from typing import Any
 import pytest
 
 from drivers.errors import DriverError
-from hil_tests.mastctl.service_fakes import CONFIG, FakeHardware, Hang, fake_daemon
+from hil_tests.mastctl.service_fakes import CONFIG, Hang, fake_daemon
 from hil_tests.waiting import NET_S, until
 from mastctl.cli.main import main
 from mastctl.client import Client
@@ -228,45 +227,3 @@ def test_the_commands_work_with_a_broken_configuration(
         assert asked == [[("stop", None, None)], []]
         assert main(["estop", "--config", str(config)]) == 0
         assert [len(one) for one in asked] == [2, 0]
-
-
-@pytest.fixture
-def usual(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[tuple[str, FakeHardware]]:
-    """A daemon at the packaged configuration's address, found by that address alone; and its hardware."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    with fake_daemon(monkeypatch, tmp_path, f"{{port: {port}}}") as (daemon, hardware):
-        assert daemon.service.stop_socket is not None
-        daemon.service.stop_socket.close()
-        monkeypatch.delenv("MASTCTL_URL", raising=False)
-        monkeypatch.setattr("mastctl.config.default_config", lambda: tmp_path / "daemon.yaml")
-        monkeypatch.setattr("mastctl.packaged.default_config", lambda: tmp_path / "daemon.yaml")
-        yield daemon.url, hardware
-
-
-@pytest.mark.parametrize(
-    "words",
-    [
-        ["stop"],
-        ["estop", "--name", "Ana"],
-        ["point", "--angles", "0.1", "0"],
-    ],
-)
-def test_a_daemon_of_another_user_is_commanded_only_by_its_name(
-    usual: tuple[str, FakeHardware],
-    words: list[str],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    url, hardware = usual
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "getuid", lambda: 4242)
-        assert main(words) == 1
-        said = capsys.readouterr().err
-        assert f"the daemon at {url} was started by" in said and "--url" in said
-        assert ("stop",) not in hardware.head.calls
-        assert main(["status"]) == 0, "reading is free"
-        assert "ready" in capsys.readouterr().out
-        assert main(["stop", "--url", url]) == 0
-    assert f"at {url}" in capsys.readouterr().out

@@ -87,7 +87,7 @@ def test_a_bumped_camera_is_seen_by_two_looks_and_reported_everywhere(
     assert (code, said.startswith(what)) == (1, True), said
     assert " sigma" in said and "since " in said
     assert stands(client) == pytest.approx(before, abs=1e-3)
-    answer = client.sentinel()
+    answer = client.request("GET", "/sentinel")
     assert (answer["level"], undated(answer["sentence"])) == ("bad", undated(said))
 
     def in_status() -> bool:
@@ -96,12 +96,11 @@ def test_a_bumped_camera_is_seen_by_two_looks_and_reported_everywhere(
 
     until(in_status, "the finding in the status")
     assert client.status()["faults"] == [] and client.status()["state"] == "ready"
-    health = client.calibration_health()
+    health = client.request("GET", "/calibration/health")
     assert (health["verdict"], health["since"]) == ("drifts", answer["since"])
     assert health["sentence"].startswith(f"reference pictures: {what}")
     assert client.status()["calibration"] == {
-        key: health[key]  # type: ignore[literal-required]
-        for key in client.status()["calibration"] or ()
+        key: health[key] for key in client.status()["calibration"] or ()
     }
     assert health["sentinel"] is not None and health["sentinel"]["sentence"].startswith(what)
     text = daemon.service.metrics.text().decode()

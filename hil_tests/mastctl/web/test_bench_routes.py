@@ -55,7 +55,7 @@ def never_gives_up(job: BenchJob, link: Connection) -> Mapping[str, Any]:
 
 def says_its_session(job: BenchJob, link: Connection) -> Mapping[str, Any]:
     """Its token backwards: sentences are kept, and the token must not be."""
-    session = steers(job).session()
+    session = steers(job).request("GET", "/session")
     assert job.token is not None
     return {"sentences": [json.dumps([session["name"], session["role"], job.token[::-1]])]}
 
@@ -98,7 +98,7 @@ def test_a_bench_run_takes_the_lease_of_the_client_that_begins_it(
     ana.use_lease(lease["lease_id"])
     run = ana.begin_bench("charuco_a3", wanted_px=0.3, pictures=20)
     assert (run["by"], run["state"], run["most"]) == ("Ana", "running", 20)
-    assert "Ana began it" in str(refused("lease_over", ana.renew_lease))
+    assert "Ana began it" in str(refused("lease_over", lambda: ana.request("POST", "/lease/renew")))
     ana.use_lease(None)
     for client in (ana, bo):
         told = refused("leased", partial(client.point, pan_rad=0.0, tilt_rad=0.0))

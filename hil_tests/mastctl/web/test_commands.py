@@ -75,7 +75,7 @@ def test_while_one_program_has_the_lease_another_moves_nothing(
             rover.look,
             rover.stop_track,
             lambda: rover.use_mast("little.yaml"),
-            rover.use_former_mast,
+            lambda: rover.request("POST", "/mast/back"),
             lambda: rover.acquire_lease(),
         ):
             error = refused("leased", command)

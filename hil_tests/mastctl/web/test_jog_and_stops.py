@@ -10,7 +10,7 @@ import pytest
 from hil_tests.mastctl.service_fakes import FakeHardware
 from hil_tests.waiting import NET_S, until
 from mastctl.client import Client, ClientError
-from mastctl.client.jog import Jog
+from mastctl.client.steering import Jog
 from mastctl.daemon import RunningDaemon
 from mastctl.motion import jog as jog_module
 from mastctl.safety.stop_socket import request

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,6 +16,11 @@ Pair = tuple[RunningDaemon, FakeHardware]
 FILE = "places.json"
 HOME = {"pan_rad": 0.0, "tilt_rad": 0.0}
 CHART = {"pan_rad": 0.5, "tilt_rad": -0.25}
+CHART_2 = "colour%20chart%202"
+
+
+def places(client: Client) -> Any:
+    return client.request("GET", "/places")["places"]
 
 
 def refused(code: str, act: Callable[[], object]) -> str:
@@ -26,11 +32,13 @@ def refused(code: str, act: Callable[[], object]) -> str:
 
 def test_what_one_keeps_another_sees_and_forgets(pair: Pair) -> None:
     with Client(pair[0].url, name="bench") as bench, Client(pair[0].url, name="rover") as rover:
-        assert bench.places() == {"home": HOME}
-        bench.keep_place("colour chart 2", **CHART)
-        assert rover.places() == {"home": HOME, "colour chart 2": CHART}
-        assert rover.forget_place("colour chart 2") == {"home": HOME}
-        assert "no place is kept by the name 'x'" in refused("place_unknown", lambda: bench.forget_place("x"))
+        assert places(bench) == {"home": HOME}
+        bench.request("POST", f"/places/{CHART_2}", **CHART)
+        assert places(rover) == {"home": HOME, "colour chart 2": CHART}
+        assert rover.request("DELETE", f"/places/{CHART_2}") == {"places": {"home": HOME}}
+        assert "no place is kept by the name 'x'" in refused(
+            "place_unknown", lambda: bench.request("DELETE", "/places/x")
+        )
     assert not [call for call in pair[1].head.calls if call[0] == "move"], "nothing moves by it"
 
 
@@ -38,11 +46,11 @@ def test_places_outlive_the_daemon(monkeypatch: pytest.MonkeyPatch, tmp_path: Pa
     state = tmp_path / "state"
     config = f"{CONFIG}state: {{{{folder: {state}}}}}\n"
     with fake_daemon(monkeypatch, tmp_path, config=config) as (daemon, _), Client(daemon.url) as client:
-        client.keep_place("chart", **CHART)
+        client.request("POST", "/places/chart", **CHART)
     with fake_daemon(monkeypatch, tmp_path, config=config) as (daemon, _), Client(daemon.url) as client:
-        assert client.places()["chart"] == CHART
+        assert places(client)["chart"] == CHART
         (state / FILE).write_text("{")
-        assert FILE in refused("unreadable", client.places)
-        refused("unreadable", lambda: client.keep_place("chart", **CHART))
+        assert FILE in refused("unreadable", lambda: places(client))
+        refused("unreadable", lambda: client.request("POST", "/places/chart", **CHART))
         assert (state / FILE).read_text() == "{", "what cannot be read is not written over"
         client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))

@@ -178,7 +178,7 @@ def test_a_stop_that_is_not_confirmed_is_told_loudly(pair: BOTH, visit: Visits) 
     assert "NOT CONFIRMED" in said.inner_text()
     hardware.head.hook = lambda name: None
     with Client(daemon.url) as client:
-        client.keep_place("chart", 0.1, 0.1)
+        client.request("POST", "/places/chart", pan_rad=0.1, tilt_rad=0.1)
         one.page.get_by_role("button", name="chart", exact=True).wait_for()
         assert said.is_visible(), "another command confirms no stop"
         client.stop()
@@ -336,9 +336,11 @@ def test_an_answer_from_before_a_stop_does_not_take_it_back(pair: BOTH, visit: V
 
     one.page.route("**/api/v1/status", hold)
     with Client(daemon.url) as client:
-        client.keep_place("chart", 0.1, 0.1)  # a command: the page asks for the status again
+        client.request(
+            "POST", "/places/chart", pan_rad=0.1, tilt_rad=0.1
+        )  # a command: the page asks for the status again
         until(lambda: one.page.title() and held, "the page requests it")
-        client.keep_place("board", 0.2, 0.1)
+        client.request("POST", "/places/board", pan_rad=0.2, tilt_rad=0.1)
         one.page.wait_for_timeout(1500)
         assert len(asked) == 1, "one question at a time"
         client.estop(name="Ana", reason="sparks")
@@ -354,7 +356,7 @@ def test_an_answer_from_before_a_stop_does_not_take_it_back(pair: BOTH, visit: V
     with one.page.expect_response("**/api/v1/status"):  # the next one, of after the stop
         route.fulfill(response=answer)
     with one.page.expect_response("**/api/v1/status"), Client(daemon.url) as client:
-        client.forget_place("chart")
+        client.request("DELETE", "/places/chart")
     assert True not in one.page.evaluate("window.shown"), "it was never taken back"
     assert "by Ana: sparks" in one.page.locator("#estop").inner_text()
 
