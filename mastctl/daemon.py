@@ -237,7 +237,6 @@ async def _serve(
             loop.call_soon_threadsafe(end)
 
     manager = ServiceManager() if in_process else ServiceManager({})
-    service.manager = manager
     service.devices.on_turn = Heartbeat(manager, loop.call_soon_threadsafe).turn
     if in_process:
         for number in signals.wanted():

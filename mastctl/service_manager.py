@@ -39,10 +39,6 @@ class ServiceManager:
         """State that requests are answered."""
         self._send("READY=1")
 
-    def reloading(self) -> None:
-        """State that the configuration is read again; `ready` ends it."""
-        self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
-
     def stopping(self) -> None:
         """State that the process ends on purpose."""
         self._send("STOPPING=1")

@@ -191,7 +191,6 @@ def test_systemd_starts_the_service_and_says_how_it_is(machine: Booted) -> None:
     assert machine.status("--wait", "30")["state"] in WELL
     until(lambda: machine.property("StatusText") in WELL, "systemd knows it")
     assert "1.4 OK" in machine.run("systemd-analyze", "security", "--no-pager", "mastctl")
-    machine.run("systemctl", "reload", "mastctl")
 
 
 def test_a_daemon_that_hangs_is_killed_its_servos_halted_and_it_comes_back(machine: Booted) -> None:

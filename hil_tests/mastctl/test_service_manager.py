@@ -49,17 +49,6 @@ def test_each_message_is_a_datagram_as_the_protocol_has_it(manager: socket.socke
     assert told(manager) == ["READY=1", "STATUS=moving: two lines", "WATCHDOG=1", "STOPPING=1"]
 
 
-def test_a_reload_carries_the_time_that_the_manager_compares() -> None:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
-        listener.bind("")  # the kernel gives an abstract name
-        listener.setblocking(False)
-        name = listener.getsockname().decode().replace("\0", "@", 1)
-        ServiceManager({"NOTIFY_SOCKET": name}).reloading()
-        lines = told(listener)[0].splitlines()
-    assert lines[0] == "RELOADING=1"
-    assert lines[1].startswith("MONOTONIC_USEC=") and lines[1].partition("=")[2].isdecimal()
-
-
 @pytest.mark.parametrize(
     ("words", "expected"),
     [

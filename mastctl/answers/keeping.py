@@ -231,22 +231,6 @@ class MastChange(TypedDict):
     former_mast: MastAnswer | None
 
 
-class ConfigChange(TypedDict):
-    """A difference of two configurations: the key, its former and its present value; null where absent."""
-
-    key: str
-    before: Any
-    after: Any
-
-
-class ReloadResult(TypedDict):
-    """``POST /reload``: what changed, the mast file in use, and sentences that say what to know of it."""
-
-    changed: list[ConfigChange]
-    mast: MastAnswer
-    notes: list[str]
-
-
 class ClientSession(TypedDict):
     """``GET /session``: the client, its rights, and the way it came.
 

@@ -175,11 +175,6 @@ REQUESTS = (
         "navcam_left",
     ),
     Request(
-        "rig reload",
-        "have the daemon read its configuration again; all of it comes into use, or nothing",
-        "POST /reload",
-    ),
-    Request(
         "record start",
         "have the daemon record until 'record stop'",
         "POST /recordings/start name",

@@ -16,12 +16,6 @@ class Calls:
 
     daemon: DaemonHttp
 
-    def reload(self) -> answers.ReloadResult:
-        """Have the daemon read its configuration again: all of it comes into use while the head rests, or
-        nothing (``restart_needed``, ``bad_config``, ``bad_mast_file``, ``busy``, ``moving``).
-        """
-        return self.daemon.command(answers.ReloadResult, "POST", "/reload")
-
     def camera_settings(self, camera: str) -> answers.CameraSettingsAnswer:
         """Return what of a camera can be changed: ``settings`` with bounds, and whether they are ``held``."""
         return self.daemon.json(answers.CameraSettingsAnswer, "GET", f"/cameras/{escaped(camera)}/settings")

@@ -72,7 +72,6 @@ TRACK_LOOK = Command("track.look", steers=True, need="motion")
 TRACK_STOP = Command("track.stop", steers=True)
 MAST = Command("mast", steers=True)  # the service checks whether the head is at rest, after reading it
 MAST_BACK = Command("mast.back", steers=True)
-RELOAD = Command("reload", "admin", steers=True)  # checked as a mast file is
 CAMERA_SETTINGS = Command("camera.settings", steers=True, need="idle")
 POSE = Command("pose")  # a fact about the rover; the track that uses it has its own holder
 SUN = Command("limits.sun")  # a fact too

@@ -363,11 +363,6 @@ class Tracker:
         with self._lock:
             self._rig = rig
 
-    def use_settings(self, limits: Limits, settings: TrackingSettings) -> None:
-        """Look within other limits and by other rules from now on."""
-        with self._lock:
-            self._limits, self._settings = limits, settings
-
     # The lock is kept
 
     def _end(self, status: TrackStatus, reason: str) -> None:

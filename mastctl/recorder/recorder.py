@@ -73,7 +73,8 @@ class Recorder:
         clock: Clock,
     ) -> None:
         self._facts = facts
-        self.use_settings(settings, others)
+        self._ring_s = settings.ring_of(facts["hardware"])
+        self._settings, self._others = settings, others
         self._folder = RecordFolder(folder)
         self._mast = mast
         self._clock = clock
@@ -98,11 +99,6 @@ class Recorder:
         self._thread.start()
 
     # For any thread: only requests to the writing thread wait for the disk, and that bounded
-
-    def use_settings(self, settings: RecordSettings, others: list[Attached]) -> None:
-        """Keep as much as this, in the same folder; attach something else from the next file on."""
-        self._ring_s = settings.ring_of(self._facts["hardware"])
-        self._settings, self._others = settings, others
 
     def add_handoff(self, line: dict[str, Any]) -> None:
         """Record a hand-off, a line of the log of hand-offs."""

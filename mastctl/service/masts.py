@@ -8,18 +8,17 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from calib.errors import BadFile, CalibError
 from calib.files import is_plain_file, read_bytes
 from calib.files.mast_file import StoredRig, parse_rig
-from calib.files.yaml_text import MAX_BYTES, parse_mapping
+from calib.files.yaml_text import MAX_BYTES
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.mode import SensorMode
 from calib.geometry.rig import Rig
 from drivers.errors import BadFrame
-from mastctl.answers import ConfigChange, MastAnswer
-from mastctl.config import Config, check_cameras, parse_config
+from mastctl.answers import MastAnswer
+from mastctl.config import Config, check_cameras
 from mastctl.control.machine import StateMachine
 from mastctl.control.operations import OperationRunner
 from mastctl.devices.devices import Devices
@@ -36,18 +35,6 @@ class BadMastFile(BadRequest):
 
     def __init__(self, message: str) -> None:
         super().__init__("bad_mast_file", message)
-
-
-FIXED: Mapping[str, tuple[Callable[[Config], object], str]] = {
-    "listen": (lambda config: config.listen, "the address is taken at the start"),
-    "pan_tilt": (lambda config: config.hardware.pan_tilt, "the head is opened at the start"),
-    "cameras": (lambda config: config.hardware.cameras, "cameras are opened at the start"),
-    "simulation": (lambda config: config.hardware.simulation, "the simulated rover is made at the start"),
-    "state": (lambda config: config.state_folder, "the state folder is locked at the start"),
-    "record.folder": (lambda config: config.record.folder, "recordings are opened there"),
-    "tracking.handoff_log": (lambda config: config.tracking.handoff_log, "it is read at the start"),
-}
-"""Keys that a running daemon cannot change: the value in a configuration, and why it cannot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,51 +86,6 @@ def read_next(name: str, config: Config, now: MastInUse, sensor_modes: Mapping[s
     if stored.digest != now.stored.digest:  # the one in use is no change, whatever joined since
         _check_modes(found, sensor_modes)
     return found
-
-
-def named_next(
-    before: Config, after: Config, now: MastInUse, sensor_modes: Mapping[str, SensorMode]
-) -> MastInUse | None:
-    """Return the mast file that comes into use with a configuration; None if the one in use stays.
-
-    One that a command has put into use stays as long as the configuration names the same as before. Raises
-    BadMastFile.
-    """
-    if after.mast_file == before.mast_file and now.path != after.mast_file:
-        return None
-    named = read_next(after.mast_file.name, after, now, sensor_modes)
-    return None if named.stored.digest == now.stored.digest else named
-
-
-def check_fixed(before: Config, after: Config) -> None:
-    """Pass a configuration with the former one's keys of `FIXED`. Raises NotNow ``restart_needed``."""
-    was = parse_config(before.data, before.path) if before.data else before
-    refused = [f"{key} ({why})" for key, (of, why) in FIXED.items() if of(was) != of(after)]
-    if refused:
-        message = (
-            f"{before.path} has another {', '.join(refused)}; nothing was changed: restart the daemon for it"
-        )
-        raise NotNow("restart_needed", message)
-
-
-def changes_of(before: Config, after: Config) -> Iterator[ConfigChange]:
-    """Yield the differences of two configurations' files, key by key."""
-    old, new = (_flat(config) for config in (before, after))
-    for key in sorted({*old, *new}):
-        if old.get(key) != new.get(key):
-            yield {"key": key, "before": old.get(key), "after": new.get(key)}
-
-
-def _flat(config: Config) -> dict[str, Any]:
-    """A file's keys and those one below, ``limits.pan_rad``."""
-    document = parse_mapping(config.data, config.path) if config.data else {}
-    flat: dict[str, Any] = {}
-    for key, value in document.items():
-        if isinstance(value, dict):
-            flat |= {f"{key}.{name}": inner for name, inner in value.items()}
-        else:
-            flat[key] = value
-    return flat
 
 
 def _check_modes(mast: MastInUse, sensor_modes: Mapping[str, SensorMode]) -> None:
@@ -250,33 +192,17 @@ class Masts:
         _check_modes(former, self._devices.sensor_modes)
         return self._use(former)
 
-    @contextmanager
-    def resting(self) -> Iterator[Callable[[MastInUse], None]]:
-        """Let nothing start inside the block, which begins with a head that rests and nothing that runs.
-
-        It yields what puts another mast file into use. Raises NotNow ``busy``, ``moving``; DriverError.
-        """
+    def _use(self, mast: MastInUse) -> MastInUse:
         self._operations.let_stopped_end()
         self._devices.read()  # the machine knows whether it moves now
         with self._lock:
             refusal = self._machine.refusal("rest")
             if refusal is not None:
                 raise refusal
-            yield self._put
-
-    def use_config(self, config: Config) -> None:
-        """Read further mast files for another configuration, inside `resting`."""
-        self._config = config
-
-    def _use(self, mast: MastInUse) -> MastInUse:
-        with self.resting() as put:
-            put(mast)
-        return mast
-
-    def _put(self, mast: MastInUse) -> None:
-        self._follow(mast)
-        self.in_use, self.former = mast, self.in_use
-        self._machine.publisher.publish("mast", "in_use", mast.as_json())
+            self._follow(mast)
+            self.in_use, self.former = mast, self.in_use
+            self._machine.publisher.publish("mast", "in_use", mast.as_json())
         for note in mast.stored.notes:
             log.warning("%s", note)
         log.info("mast file %s (%s) is in use", mast.path.name, mast.stored.digest[:12])
+        return mast

@@ -11,18 +11,15 @@ import math
 import random
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
-from calib.errors import BadFile
 from calib.files.mast_file import StoredRig
 from calib.geometry.rigid import FloatArray
 from calib.matching.handoff import MatchedHandoff
 from drivers.clock import Clock, SystemClock
-from drivers.errors import BadOptions
 from drivers.hardware import Hardware, clock_for, head_name
 from drivers.simulation_clock import SimulationClock
 from mastctl.answers import (
@@ -32,14 +29,13 @@ from mastctl.answers import (
     KeptTarget,
     MeasuredJoints,
     PanoramaDrawn,
-    ReloadResult,
     Status,
     StopAnswer,
     TrackAnswer,
 )
 from mastctl.as_json import as_json
 from mastctl.bench.operation import BenchOperation
-from mastctl.config import Config, check_cameras, load_config
+from mastctl.config import Config
 from mastctl.control.entry import (
     ESTOP,
     STOP,
@@ -57,9 +53,8 @@ from mastctl.control.publisher import Topic
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import OPERATIONS, StampedFrame, check_known, random_run
 from mastctl.devices.joint_history import HeadReading
-from mastctl.devices.judge import OutsideLimits
 from mastctl.devices.opening import open_rig
-from mastctl.errors import BadRequest, MastctlError, NotNow
+from mastctl.errors import MastctlError, NotNow
 from mastctl.motion.jog import Jogs
 from mastctl.motion.requests import wrong_camera
 from mastctl.motion.search import in_picture
@@ -73,19 +68,10 @@ from mastctl.safety import stop_socket
 from mastctl.safety.latch import Latch
 from mastctl.safety.state_folder import StateFolder, head_folders
 from mastctl.safety.stop_socket import StopSocket, Verb
-from mastctl.service.masts import (
-    MastInUse,
-    Masts,
-    changes_of,
-    check_fixed,
-    configured,
-    named_next,
-    read_mast,
-)
+from mastctl.service.masts import MastInUse, Masts, configured, read_mast
 from mastctl.service.places import places, targets
 from mastctl.service.steering import Steering
 from mastctl.service.stopping import Stopping, StopThreads, state_faults
-from mastctl.service_manager import ServiceManager
 from mastctl.watch.handoffs import HandoffCheck, line_of
 from mastctl.watch.journal import JournalThread
 from mastctl.watch.metrics import Metrics
@@ -181,7 +167,6 @@ class Service:
         self.devices.watch_faults(self._own_faults)
         self.stop_socket: StopSocket | None = None
         self._socket_folder: StateFolder | None = None
-        self.manager = ServiceManager({})
         self._closing = threading.Lock()
         self._closed = False
 
@@ -470,70 +455,12 @@ class Service:
             *state_faults(self.folder, self.latch, self.started_s),
         )
 
-    def reload(self) -> ReloadResult:
-        """Read the configuration's file again and use it; return the changes, the mast file, and notes.
-
-        All of it comes into use while the head rests, or nothing where it raises: BadRequest ``bad_config``,
-        ``bad_mast_file``; NotNow ``restart_needed`` if a key of `FIXED` differs; ``busy``, ``moving``;
-        DriverError if the head does not answer.
-        """
-        self.manager.reloading()
-        before = self.config
-        try:
-            after = load_config(before.path)
-            check_fixed(before, after)
-            mast = named_next(before, after, self.masts.in_use, self.devices.sensor_modes)
-            check_cameras(after, (mast or self.masts.in_use).stored.rig)
-            after = replace(after, listen=before.listen)  # as the command line may have it
-            with self.masts.resting() as use:
-                self._use_config(after)
-                if mast is not None:
-                    use(mast)
-        except (
-            BadFile,
-            BadOptions,
-        ) as error:  # the judge has not taken the limits, and nothing else had its turn
-            raise BadRequest("bad_config", " ".join(str(error).split())) from None
-        finally:
-            self.manager.ready()
-        changed = list(changes_of(before, after))
-        log.info(
-            "the configuration was read again: %s", ", ".join(one["key"] for one in changed) or "no change"
-        )
-        return {"changed": changed, "mast": self.masts.in_use.as_json(), "notes": list(self._notes())}
-
-    def _notes(self) -> Iterator[str]:
-        """Sentences about the head and new limits."""
-        reading = self.devices.last_reading
-        if reading is not None:
-            try:
-                self.config.limits.check(reading.pan_rad, reading.tilt_rad)
-            except OutsideLimits as error:
-                yield f"the head is where it may not be sent any more: {error}; it may be sent back inside"
-        for fault in self.devices.judge.faults(reading):
-            yield fault.message
-
-    def _use_config(self, config: Config) -> None:
-        """Use another configuration of the same devices while nothing runs; the limits first.
-
-        Raises BadOptions if the head does not keep its limits; nothing has changed.
-        """
-        self.devices.judge.use_limits(config.limits)
-        if config.sun != self.config.sun:
-            self.devices.judge.use_sun(config.sun)
-        self.config = config
-        rig = configured(self.stored.rig, config.hardware.cameras)
-        self.steering.use_rig(rig, config.repeat_after_s)
-        self.tracker.use_settings(config.limits, config.tracking)
-        self.recorder.use_settings(config.record, [Attached(config.path.name, config.data)])
-        self.masts.use_config(config)
-
     def _use_mast(self, mast: MastInUse) -> None:
         """Have every part use another mast file."""
         stored = mast.stored
         rig = configured(stored.rig, self.config.hardware.cameras)
         self.devices.use_rig(stored.rig, stored.digest)
-        self.steering.use_rig(rig, self.config.repeat_after_s)
+        self.steering.rig = rig
         self.tracker.use_rig(rig, mast.path.name)
         self.handoffs.use_mast(stored.digest)
         self.health.use_mast(stored)

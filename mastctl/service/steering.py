@@ -76,10 +76,6 @@ class Steering:
         self._operations = operations
         self._tracker = tracker
         self._health = health
-        self.use_rig(rig, repeat_after_s)
-
-    def use_rig(self, rig: Rig, repeat_after_s: float | None) -> None:
-        """Point by another mast file, and by these settings, from now on."""
         self.rig = rig
         self._settings = PointingSettings()
         if repeat_after_s is not None:

@@ -1,4 +1,4 @@
-"""Routes of what a daemon keeps: mast files, places, recordings, its configuration, benches."""
+"""Routes of what a daemon keeps: mast files, places, recordings, benches."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ RunName = Annotated[
 
 
 def add_masts(app: FastAPI) -> None:
-    """The mast file in use, another one, and the configuration read again."""
+    """The mast file in use, and another one."""
 
     @app.get(
         f"{PREFIX}/mast",
@@ -62,11 +62,6 @@ def add_masts(app: FastAPI) -> None:
         """Go back to the former mast file."""
         masts = here.service.masts
         return _mast_change(masts, masts.back())
-
-    @command(app, "POST /reload", entry.RELOAD)
-    def read_again(here: Here) -> answers.ReloadResult:
-        """Read the configuration again: all of it comes into use, or nothing."""
-        return here.service.reload()
 
 
 def _mast_change(masts: Masts, mast: MastInUse) -> answers.MastChange:

@@ -398,7 +398,7 @@ def test_on_the_loopback_address_every_client_may_do_everything(
             picture = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "image", "Sec-Fetch-Mode": "no-cors"}
             assert code(web.get("/snapshot/navcam_left", headers=picture)) == (403, "foreign_origin")
         with httpx.Client(base_url=f"{daemon.url}/api/v1", headers=by_a_proxy, **PLAIN) as web:
-            for path in ("/point", "/lease", "/reset", "/track", "/reload"):
+            for path in ("/point", "/lease", "/reset", "/track", "/panoramas"):
                 refusal = web.post(path, json=ANGLES)
                 assert code(refusal) == (401, "no_token")
                 assert "proxy" in refusal.text and "listen.hosts" in refusal.text

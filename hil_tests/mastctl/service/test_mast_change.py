@@ -114,7 +114,7 @@ def test_no_jog_begins_while_a_mast_file_is_changed(
 ) -> None:
     service = pair[0].service
     with ThreadPoolExecutor(1) as pool:
-        with service.masts.resting():
+        with service.masts.unchanged():
             jog = pool.submit(service.jogs.beat, JogBeat(pan_rad_per_s=0.1, tilt_rad_per_s=0.0, sequence=1))
             with pytest.raises(TimeoutError):
                 jog.result(0.2)
