@@ -6,7 +6,7 @@ import json
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, ClassVar
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +23,7 @@ class FrameFacts:
     picture, as while it was being changed.
     """
 
+    __pydantic_config__: ClassVar = {"strict": False}  # in files it is a mapping
     frame_id: str
     camera: str
     sequence: int

@@ -77,14 +77,13 @@ class MosaicSurface:
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.kind == "sphere":
                 along = np.sum(off * rays, axis=-1)
-                way = -along + np.sqrt(along**2 - np.sum(off * off, axis=-1) + self.value_m**2)
+                ranges = -along + np.sqrt(along**2 - np.sum(off * off, axis=-1) + self.value_m**2)
             else:
-                way = np.where(
-                    rays[..., 2] > 0.0, (self._depth(origin_m) - off[..., 2]) / rays[..., 2], np.inf
-                )
-            met = np.isfinite(way) & (way > 0.0)
-            there = np.where(met[..., None], off + np.where(met, way, 0.0)[..., None] * rays, rays)
-        return np.asarray(there / np.linalg.norm(there, axis=-1, keepdims=True))
+                down = (self._depth(origin_m) - off[..., 2]) / rays[..., 2]
+                ranges = np.where(rays[..., 2] > 0.0, down, np.inf)
+        met = np.isfinite(ranges) & (ranges > 0.0)
+        toward = np.where(met[..., None], off + np.where(met, ranges, 0.0)[..., None] * rays, rays)
+        return np.asarray(toward / np.linalg.norm(toward, axis=-1, keepdims=True))
 
     def _depth(self, origin_m: FloatArray) -> float:
         """How far the ground lies below the origin, metres."""
@@ -111,7 +110,7 @@ class Canvas:
 
     @property
     def origin_m(self) -> FloatArray:
-        """(3,) the mosaic's origin in the rover frame."""
+        """The mosaic's origin (3,) in the rover frame."""
         return self.rover_from_mosaic.translation_m
 
     def directions(self, pixels_px: ArrayLike) -> FloatArray:
@@ -129,9 +128,7 @@ class Canvas:
         return self.rover_from_mosaic.vectors(there)
 
     def pixels(self, directions: ArrayLike) -> FloatArray:
-        """Return the pixels (..., 2) of directions (..., 3) of the rover frame, of those a turn apart the one
-        nearest the middle.
-        """
+        """Return the pixels (..., 2) of rover-frame directions (..., 3), within half a turn of the middle."""
         local = self.rover_from_mosaic.inverse.vectors(directions)
         level = np.hypot(local[..., 0], local[..., 1])
         turn = 2.0 * math.pi * self.px_per_rad
@@ -186,15 +183,19 @@ def canvas_of(
 ) -> Canvas:
     """Return the canvas that holds all that some cameras (in the rover frame) see, at the lens' resolution.
 
-    That is less where the canvas would have more than 30,000 pixels along a side, or 60 million in all.
-    Raises CalibError if ``px_per_rad`` is less than 60, or makes it larger than that.
+    It is less where a side would have more than 30,000 pixels, or all 60 million. Raises CalibError if
+    ``px_per_rad`` is less than 60, or makes it larger than that.
     """
     scale = max(camera.focal_px[0] for camera in cameras) if px_per_rad is None else px_per_rad
     if not scale >= LEAST_PX_PER_RAD:
         raise CalibError(
             f"{scale:g} px per radian where {LEAST_PX_PER_RAD:g} (about 1 px per degree) or more are expected"
         )
-    about_rad = _middle_rad(rover_from_mosaic.inverse.vectors([_middle(camera) for camera in cameras]))
+    about_rad = _middle_rad(
+        rover_from_mosaic.inverse.vectors(
+            [camera.ray(camera.image_center_px).directions for camera in cameras]
+        )
+    )
     probe = Canvas(projection, scale, about_rad, 0.0, (1, 1), rover_from_mosaic, surface)
     borders = np.concatenate([probe.of_camera(camera, border(camera)) for camera in cameras])
     borders = np.concatenate([borders, _poles(cameras, probe)])
@@ -202,9 +203,9 @@ def canvas_of(
     if projection == "cylindrical":
         borders = borders[np.abs(borders[:, 1]) < math.tan(STEEPEST_RAD) * scale]
     # Straight ahead lies between pixels, as in the middle of a whole sphere with an even number of them.
-    ahead = np.array([-about_rad * scale, 0.0])
-    low = np.floor(borders.min(axis=0) - ahead - 0.5) + 0.5
-    size = np.ceil(borders.max(axis=0) - ahead - low).astype(int) + 1
+    zero = np.array([-about_rad * scale, 0.0])
+    low = np.floor(borders.min(axis=0) - zero - 0.5) + 0.5
+    size = np.ceil(borders.max(axis=0) - zero - low).astype(int) + 1
     width, height = min(int(size[0]), int(2.0 * math.pi * scale)), int(size[1])
     most = min(MOST_PX / max(width, height), math.sqrt(MOST_AREA_PX / (width * height)))
     if most < 1.0:
@@ -252,8 +253,3 @@ def _middle_rad(directions: FloatArray) -> float:
     gaps = np.diff(azimuth, append=azimuth[0] + 2.0 * math.pi)
     cut = azimuth + gaps / 2.0
     return math.remainder(float(cut[np.argmax(gaps - 0.05 * np.cos(cut))]) + math.pi, 2.0 * math.pi)
-
-
-def _middle(camera: CameraModel) -> FloatArray:
-    """(3,) the direction of the middle of a camera's image."""
-    return np.asarray(camera.ray(np.array(camera.image_center_px)).directions)

@@ -9,15 +9,17 @@ between them alike, and is found by its size and axis.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import groupby
 from typing import Literal
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, with_config
 
 from calib.errors import CalibError
 from calib.geometry.cahvor import CameraModel
@@ -28,6 +30,8 @@ from calib.matching.patch import MatchSettings, match_patch
 from calib.matching.warp import Grey, Plane, PosedImage, facing_plane, grey, parallax_px_m
 
 Picture = NDArray[np.uint8]
+Pictures = Callable[[int], Picture]
+"""A camera's picture by its number."""
 Owners = NDArray[np.int16]
 
 BLOCK_ROWS = 64
@@ -42,11 +46,18 @@ SEARCH_PX = 16.0
 MATCH = MatchSettings(roughness=0.0)
 RELIEF_PER_M = 0.5
 """One sigma of what the scene's inverse range may differ from the surface by, for the test of slips."""
+Axis = Literal["pan", "tilt"]
+Angles = tuple[float, float]
+AXES: tuple[Axis, Axis] = ("pan", "tilt")
 STEP_RAD = 1e-4
+WEAKEST_RAD = 0.05
+"""A slip that seams measure with a larger sigma is not looked for."""
+AS_YAML = ConfigDict(strict=False)
+"""A list of an index is the tuple here."""
 LEAST_SLIP_RAD = 5e-4
 """Smaller ones are what good mast files leave: up to 0.3 mrad of the packaged one."""
-SLIP_CHI2 = 30.0
-"""A slip explains this much, or none is named: with 100 views one of 30,000 panoramas has it by chance."""
+SLIP_SIGMA = 5.5
+"""A slip is larger, or none is named: with 100 views one of 30,000 panoramas has it by chance."""
 GROSS_SIGMA = 5.0
 
 
@@ -100,43 +111,44 @@ def _nearest(
 
 
 def composed(
-    pictures: Sequence[Picture], owners: Owners, places: NDArray[np.float32], gains: FloatArray | None = None
+    pictures: Pictures, owners: Owners, places: NDArray[np.float32], gains: FloatArray | None = None
 ) -> Picture:
     """Return the mosaic (h, w) or (h, w, 3) of pictures, each times its gain; black where there is none."""
-    mosaic = np.zeros(owners.shape + pictures[0].shape[2:], np.uint8)
-    for number, picture in enumerate(pictures):
+    mosaic = np.zeros(owners.shape + pictures(0).shape[2:], np.uint8)
+    for number in range(int(owners.max()) + 1):
         mine = owners == number
         rows, columns = (np.flatnonzero(mine.any(axis=one)) for one in (1, 0))
         if not len(rows):
             continue
         part = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         x, y = (np.ascontiguousarray(places[part][..., one]) for one in (0, 1))
-        drawn = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        drawn = cv2.remap(pictures(number), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         if gains is not None:
             drawn = cv2.convertScaleAbs(drawn, alpha=float(gains[number]))
         mosaic[part][mine[part]] = drawn[mine[part]]
     return mosaic
 
 
-def gains_of(canvas: Canvas, cameras: Sequence[CameraModel], pictures: Sequence[Picture]) -> FloatArray:
+def gains_of(canvas: Canvas, cameras: Sequence[CameraModel], pictures: Pictures) -> FloatArray:
     """Return one factor for each picture (n,) by which overlaps agree in brightness; their mean is 1.
 
     Least squares of the medians' logarithms, each overlap by the number of its pixels.
     """
     small = canvas.at(canvas.px_per_rad / REDUCED)
-    drawn = [_drawn(small, camera, picture) for camera, picture in zip(cameras, pictures, strict=True)]
+    drawn = [_drawn(small, camera, pictures(number)) for number, camera in enumerate(cameras)]
     rows, ratios = [], []
     for i, one in enumerate(drawn):
         for j in range(i + 1, len(drawn)):
-            both = _within(one) & _within(drawn[j])
+            ratio = drawn[j] / one
+            both = np.isfinite(ratio)
             if (count := int(both.sum())) < REDUCED**2:
                 continue
             row = np.zeros(len(drawn))
             row[[i, j]] = math.sqrt(count), -math.sqrt(count)
             rows.append(row)
-            ratios.append(math.sqrt(count) * float(np.median(np.log(drawn[j][both] / one[both]))))
+            ratios.append(math.sqrt(count) * float(np.median(np.log(ratio[both]))))
     if not rows:
-        return np.ones(len(pictures))
+        return np.ones(len(drawn))
     logs = np.linalg.lstsq(np.array(rows), np.array(ratios), rcond=None)[0]
     return np.asarray(np.exp(logs - np.mean(logs)))
 
@@ -157,23 +169,34 @@ class SeamPatch:
     parallax_px_m: FloatArray
 
 
+@with_config(AS_YAML)
 @dataclass(frozen=True)
 class Slip:
-    """A joint that stood beside its reading from a view on: how far, one sigma, the chi-square explained.
+    """A joint that stood beside its reading from a view on: how far, one sigma.
 
     ``from_view`` 0: in all views, an error of tilt's zero; pan's turns the whole mosaic and shows nowhere.
     """
 
-    axis: Literal["pan", "tilt"]
+    axis: Axis
     from_view: int
     size_rad: float
     sigma_rad: float
-    chi2: float
+
+    sentence: str = ""
+
+    def numbered(self, view: int) -> Slip:
+        """Return it with another number of its view, and as a person reads it."""
+        where = f"from view {view} on" if self.from_view else "in all views"
+        size = f"{1e3 * self.size_rad:+.2f} ± {1e3 * self.sigma_rad:.2f} mrad"
+        return replace(
+            self, from_view=view, sentence=f"{self.axis} truly stood {size} beside its reading {where}"
+        )
 
 
+@with_config(AS_YAML)
 @dataclass(frozen=True)
 class SeamError:
-    """What seams measure: rms of dx and dy, px of the camera; what the matches explain of it; how many.
+    """A seam of two views, or all: rms of dx and dy, px, what the matches explain of it, how many.
 
     ``across_px``: rms across the parallax, which no relief of the scene moves, with the matches' own.
     """
@@ -183,6 +206,7 @@ class SeamError:
     across_px: tuple[float, float]
     count: int
     left_out: int
+    views: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,43 +214,42 @@ class Seams:
     """The seams of a mosaic: all patches, the error of each pair of views, and of the whole."""
 
     patches: tuple[SeamPatch, ...] = ()
-    by_views: Mapping[tuple[int, int], SeamError] = field(default_factory=dict)
+    by_views: tuple[SeamError, ...] = ()
     whole: SeamError | None = None
 
 
-def seams_of(canvas: Canvas, cameras: Sequence[CameraModel], pictures: Sequence[Picture]) -> Seams:
+def seams_of(canvas: Canvas, cameras: Sequence[CameraModel], pictures: Pictures) -> Seams:
     """Measure how well pictures agree where they meet, by their cameras (in the rover frame)."""
-    greys = lru_cache(GREYS_KEPT)(lambda number: grey(pictures[number]))
-    small = canvas.at(canvas.px_per_rad / REDUCED)
-    owners, _ = frames_of(small, cameras)
-    patches = []
-    for views, spots in sorted(_seam_spots(owners).items()):
-        for spot in spots:
-            place = spot * REDUCED
-            patch = _measured(canvas, cameras, greys, views, place)
-            if patch is not None:
-                patches.append(patch)
+    greys = lru_cache(GREYS_KEPT)(lambda number: grey(pictures(number)))
+    owners, _ = frames_of(canvas.at(canvas.px_per_rad / REDUCED), cameras)
+    spots = _seam_spots(owners)
+    patches = [
+        patch
+        for views in sorted(spots)
+        for spot in spots[views]
+        if (patch := _measured(canvas, cameras, greys, views, spot * REDUCED)) is not None
+    ]
     if not patches:
         return Seams()
-    pairs = sorted({patch.views for patch in patches})
-    by_views = {pair: seam_error([one for one in patches if one.views == pair]) for pair in pairs}
-    return Seams(tuple(patches), by_views, seam_error(patches))
+    by_views = [
+        replace(_error_of([*those]), views=views) for views, those in groupby(patches, lambda one: one.views)
+    ]
+    return Seams(tuple(patches), tuple(by_views), _error_of(patches))
 
 
-def seam_error(patches: Sequence[SeamPatch]) -> SeamError:
-    """Return the error of some patches, but for those beyond 5 robust sigma of their middle."""
+def _error_of(patches: Sequence[SeamPatch]) -> SeamError:
+    """The error of some patches, but for those beyond 5 robust sigma of their middle."""
     off = np.array([patch.off_px for patch in patches])
-    spread = 1.4826 * np.median(np.abs(off - np.median(off, axis=0)), axis=0)
-    kept = (np.abs(off - np.median(off, axis=0)) <= GROSS_SIGMA * np.maximum(spread, 0.02)).all(axis=1)
-    covariances = np.array([patch.covariance_px2 for patch in patches])
-    along = np.array([patch.parallax_px_m for patch in patches])
-    side = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    away = np.abs(off - np.median(off, axis=0))
+    kept = (away <= GROSS_SIGMA * np.maximum(1.4826 * np.median(away, axis=0), 0.02)).all(axis=1)
+    off, covariances = off[kept], np.array([patch.covariance_px2 for patch in patches])[kept]
+    side = np.array([patch.parallax_px_m for patch in patches])[kept][:, ::-1] * (-1.0, 1.0)
     side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-12)
-    across = np.einsum("ni,ni->n", side, off), np.sqrt(np.einsum("ni,nij,nj->n", side, covariances, side))
-    x, y = np.sqrt(np.mean(off[kept] ** 2, axis=0)).tolist()
-    sx, sy = np.sqrt(np.mean(covariances[kept][:, (0, 1), (0, 1)], axis=0)).tolist()
-    a, sa = (float(np.sqrt(np.mean(one[kept] ** 2))) for one in across)
-    return SeamError((x, y), (sx, sy), (a, sa), int(kept.sum()), int((~kept).sum()))
+    across = np.sqrt(np.mean(np.einsum("ni,ni->n", side, off) ** 2))
+    matched = np.sqrt(np.mean(np.einsum("ni,nij,nj->n", side, covariances, side)))
+    x, y = np.sqrt(np.mean(off**2, axis=0)).tolist()
+    sx, sy = np.sqrt(np.mean(covariances[:, (0, 1), (0, 1)], axis=0)).tolist()
+    return SeamError((x, y), (sx, sy), (float(across), float(matched)), len(off), len(patches) - len(off))
 
 
 def slip_of(
@@ -240,67 +263,57 @@ def slip_of(
 
     Relief off the surface moves patches along their parallax, which counts with a variance of its own.
     """
-    weights: list[FloatArray] = []
-    for patch in patches:
-        relief = RELIEF_PER_M**2 * np.outer(patch.parallax_px_m, patch.parallax_px_m)
-        weights.append(np.asarray(np.linalg.inv(patch.covariance_px2 + relief + 1e-4 * np.eye(2))))
     if not patches:
         return None
-    weight, off = np.array(weights), np.array([patch.off_px for patch in patches])
-    views = np.array([patch.views for patch in patches])
-    best: Slip | None = None
-    for axis, turn in (("pan", (STEP_RAD, 0.0)), ("tilt", (0.0, STEP_RAD))):
-        rates = {
-            which: np.array([_rate(rig, camera, angles_rad, canvas, patch, turn, which) for patch in patches])
-            for which in ((True, False), (False, True), (True, True))
-        }
-        for start in range(len(angles_rad)):
-            first, second = views[:, 0] >= start, views[:, 1] >= start
-            rate = np.zeros_like(off)
-            for (one, other), values in rates.items():
-                rate[(first == one) & (second == other)] = values[(first == one) & (second == other)]
-            slip = _fitted(rate, off, weight, axis, start)
-            if slip is not None and (best is None or slip.chi2 > best.chi2):
-                best = slip
-    named = best is not None and best.chi2 > SLIP_CHI2 and abs(best.size_rad) > LEAST_SLIP_RAD
+    views, off = np.array([patch.views for patch in patches]), np.array([patch.off_px for patch in patches])
+    relief = RELIEF_PER_M * np.array([patch.parallax_px_m for patch in patches])
+    noise = np.array([patch.covariance_px2 for patch in patches]) + 1e-4 * np.eye(2)
+    weight = np.linalg.inv(noise + np.einsum("ni,nj->nij", relief, relief))
+    slips: list[Slip | None] = []
+    for axis in AXES:
+        rates = np.array([_rates(rig, camera, angles_rad, canvas, patch, axis) for patch in patches])
+        moved = [np.einsum("nv,nvi->ni", views >= start, rates) for start in range(len(angles_rad))]
+        slips += [_fitted(rate, off, weight, axis, start) for start, rate in enumerate(moved)]
+    best = max(filter(None, slips), key=lambda one: abs(one.size_rad) / one.sigma_rad, default=None)
+    named = best is not None and abs(best.size_rad) > max(LEAST_SLIP_RAD, SLIP_SIGMA * best.sigma_rad)
     return best if named else None
 
 
-def _fitted(rate: FloatArray, off: FloatArray, weight: FloatArray, axis: str, start: int) -> Slip | None:
-    """The size of a slip by least squares, gross patches left out once."""
+def _fitted(rate: FloatArray, off: FloatArray, weight: FloatArray, axis: Axis, start: int) -> Slip | None:
+    """The size of a slip by least squares, gross patches left out; None where seams do not show it."""
     kept = np.ones(len(off), np.bool_)
     size = information = 0.0
     for _ in range(3):
         information = float(np.einsum("ni,nij,nj->", rate[kept], weight[kept], rate[kept]))
-        if information < 1.0 / 0.05**2:
+        if information < 1.0 / WEAKEST_RAD**2:
             return None
         size = float(np.einsum("ni,nij,nj->", rate[kept], weight[kept], off[kept])) / information
         left = off - size * rate
         square = np.einsum("ni,nij,nj->n", left, weight, left)
         kept = square <= max(GROSS_SIGMA**2, 4.0 * float(np.median(square)))
     scale = max(1.0, float(np.mean(square[kept])) / 2.0)
-    chi2 = size**2 * information / scale
-    return Slip("pan" if axis == "pan" else "tilt", start, size, math.sqrt(scale / information), chi2)
+    return Slip(axis, start, size, math.sqrt(scale / information))
 
 
-def _rate(
-    rig: Rig, camera: str, angles_rad: Sequence[tuple[float, float]], canvas: Canvas, patch: SeamPatch,
-    turn: tuple[float, float], which: tuple[bool, bool],
-) -> FloatArray:  # fmt: skip
-    """(2,) px/rad: how a patch's offset changes if the views in ``which`` truly stood a turn further."""
-    i, j = patch.views
+def _rates(
+    rig: Rig,
+    camera: str,
+    angles_rad: Sequence[tuple[float, float]],
+    canvas: Canvas,
+    patch: SeamPatch,
+    axis: Axis,
+) -> FloatArray:
+    """(2, 2) px/rad: how a patch's offset changes if its first, or second, view truly stood further."""
 
-    def predicted(part: float) -> FloatArray:
-        at = [
-            rig.camera_in_rover(
-                camera, *(angle + part * by * moves for angle, by in zip(angles_rad[view], turn, strict=True))
-            )
-            for view, moves in ((i, which[0]), (j, which[1]))
-        ]
-        return canvas.in_camera(at[1], canvas.of_camera(at[0], patch.first_px))[0]
+    def predicted(side: int, step_rad: float) -> FloatArray:
+        angles = np.array([angles_rad[view] for view in patch.views])
+        angles[side, AXES.index(axis)] += step_rad
+        first, second = (rig.camera_in_rover(camera, pan, tilt) for pan, tilt in angles.tolist())
+        return canvas.in_camera(second, canvas.of_camera(first, patch.first_px))[0]
 
-    # The prediction is by angles that are believed: what truly happened is the other way round.
-    return np.asarray((predicted(1.0) - predicted(-1.0)) / (2.0 * math.hypot(*turn)))
+    # What is predicted is by angles that are believed: what truly happened is the other way round.
+    rates = [(predicted(side, STEP_RAD) - predicted(side, -STEP_RAD)) / (2.0 * STEP_RAD) for side in (0, 1)]
+    return np.asarray(rates)
 
 
 def _measured(
@@ -358,18 +371,11 @@ def _seam_spots(owners: Owners) -> dict[tuple[int, int], list[FloatArray]]:
 
 
 def _drawn(canvas: Canvas, camera: CameraModel, picture: Picture) -> FloatArray:
-    """A picture alone on a canvas, blurred to its pixels; not-a-number beside it."""
+    """A picture alone on a canvas, blurred to its pixels; not-a-number beside it and beyond `GREYS`."""
     blurred = cv2.blur(grey(picture), (REDUCED, REDUCED))
-    width, height = canvas.size_px
-    grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(np.float64)
+    grid = np.stack(np.meshgrid(*(np.arange(side) for side in canvas.size_px)), axis=-1).astype(np.float64)
     found, seen = canvas.in_camera(camera, grid)
     x, y = (np.where(seen, found[..., one], -1e4).astype(np.float32) for one in (0, 1))
-    return np.asarray(
-        cv2.remap(blurred, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=math.nan),
-        dtype=np.float64,
-    )
-
-
-def _within(drawn: FloatArray) -> NDArray[np.bool_]:
+    drawn = cv2.remap(blurred, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=math.nan)
     with np.errstate(invalid="ignore"):
-        return np.asarray((drawn > GREYS[0]) & (drawn < GREYS[1]))
+        return np.where((drawn > GREYS[0]) & (drawn < GREYS[1]), drawn, math.nan)

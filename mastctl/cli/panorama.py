@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import json
 import math
 from pathlib import Path
@@ -153,36 +151,34 @@ def _export(args: argparse.Namespace) -> Answer:
 
 @command(
     "panorama targets",
-    option("--csv FILE", "write them as CSV too"),
-    option("--geojson FILE", "or as features of points, metres"),
+    option("--out FILE", "write them too: a table as .csv, or as .json GeoJSON's features of points, metres"),
     *DAEMON,
     help="list the targets that are kept by a name",
 )
 def _targets(args: argparse.Namespace) -> Answer:
+    from calib.files.tables import write_rows
+
     with client_of(args) as client:
         found = client.targets()
-    if args.csv is not None:
-        text = io.StringIO()
-        rows = csv.writer(text, lineterminator="\n")
-        rows.writerow(["name", "frame", "x_m", "y_m", "z_m", "covariance_m2"])
-        for name, one in found.items():
-            covariance = one["covariance_m2"]
-            flat = "" if covariance is None else " ".join(repr(value) for row in covariance for value in row)
-            rows.writerow([name, one["frame"], *map(repr, one["position_m"]), flat])
-        check_file(args.csv, "--csv")
-        args.csv.write_text(text.getvalue(), encoding="utf-8")
-    if args.geojson is not None:
-        features = [
-            {
-                "type": "Feature",
-                "geometry": {"type": "Point", "coordinates": one["position_m"]},
-                "properties": {"name": name, "frame": one["frame"], "covariance_m2": one["covariance_m2"]},
-            }
-            for name, one in found.items()
-        ]
-        check_file(args.geojson, "--geojson")
-        document = {"type": "FeatureCollection", "features": features}
-        args.geojson.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+    if args.out is not None:
+        check_file(args.out, "--out")
+        with args.out.open("w", encoding="utf-8") as file:
+            if args.out.suffix.lower() == ".csv":
+                rows = [
+                    [name, one["frame"], *one["position_m"], json.dumps(one["covariance_m2"])]
+                    for name, one in found.items()
+                ]
+                write_rows(file, ("name", "frame", "x_m", "y_m", "z_m", "covariance_m2"), rows)
+            else:
+                features = [
+                    {
+                        "type": "Feature",
+                        "geometry": {"type": "Point", "coordinates": one["position_m"]},
+                        "properties": {"name": name, **one},
+                    }
+                    for name, one in found.items()
+                ]
+                json.dump({"type": "FeatureCollection", "features": features}, file, indent=1)
     return Answer({"targets": found})
 
 
@@ -201,15 +197,8 @@ def _targets(args: argparse.Namespace) -> Answer:
 )
 def _keep(args: argparse.Namespace) -> Answer:
     with client_of(args) as client:
-        position, frame, covariance = args.position, args.frame, None
-        if args.operation is not None:
-            record = client.operation(args.operation)
-            position, frame = record["position_m"], "rover"
-            measured = [one["detail"] for one in record["steps"] if one["name"] == "triangulate"]
-            covariance = measured[-1].get("covariance_m2") if measured else None
-            if position is None:
-                raise CommandError("no_position", f"operation {args.operation} measured no position")
-        return Answer({"targets": client.keep_target(args.name, position, frame, covariance)})
+        found = client.keep_target(args.name, args.position, args.frame, operation=args.operation)
+        return Answer({"targets": found})
 
 
 def _index(folder: Path) -> Index:

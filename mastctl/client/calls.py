@@ -97,12 +97,13 @@ class Calls:
     def keep_target(
         self,
         name: str,
-        position_m: Sequence[float],
+        position_m: Sequence[float] | None = None,
         frame: Literal["rover", "site"] = "rover",
         covariance_m2: Sequence[Sequence[float]] | None = None,
+        operation: str | None = None,
     ) -> dict[str, answers.KeptTarget]:
-        """Keep a point by a name, for all clients, in the site frame if a pose is known; return all."""
-        body = given(position_m=position_m, frame=frame, covariance_m2=covariance_m2)
+        """Keep a point, or what an operation measured, in the site frame if a pose is known; return all."""
+        body = given(position_m=position_m, frame=frame, covariance_m2=covariance_m2, operation=operation)
         return self.daemon.command(answers.TargetList, "POST", f"/targets/{escaped(name)}", body)["targets"]
 
     def true_pose(self) -> answers.TruePose:

@@ -268,6 +268,7 @@ class PointingLoop(Steps):
             detail.update(
                 position_m=rounded(point.position_m, 5),
                 sigma_m=rounded(np.sqrt(np.diag(point.covariance_m2)), 5),
+                covariance_m2=point.covariance_m2.tolist(),
                 ray_gap_m=round(point.ray_gap_m, 6),
                 range_m=round(point.ranges_m[0], 5),
             )

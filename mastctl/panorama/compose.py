@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -14,20 +14,10 @@ from calib.errors import BadFile
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.mosaic import Canvas, MosaicSurface, Projection, border, canvas_of
 from calib.geometry.rigid import FloatArray, Rigid
-from calib.matching.mosaic import Picture, SeamError, Slip, composed, frames_of, gains_of, seams_of, slip_of
+from calib.matching.mosaic import Picture, composed, frames_of, gains_of, seams_of, slip_of
 from mastctl.answers import PanoramaDrawn
-from mastctl.as_json import as_json
 from mastctl.errors import BadRequest
-from mastctl.panorama.folder import (
-    MOSAIC,
-    PREVIEW,
-    PREVIEW_PX,
-    Folder,
-    MosaicRecord,
-    SeamRecord,
-    SlipRecord,
-    write_picture,
-)
+from mastctl.panorama.folder import MOSAIC, PREVIEW, PREVIEW_PX, Folder, MosaicRecord, write_picture
 
 GROUND = MosaicSurface("ground", 0.0)
 JPEG = {cv2.IMWRITE_JPEG_QUALITY: 85}
@@ -78,18 +68,14 @@ def compose(folder: Folder, wanted: Composition, between: Callable[[], None] = l
     write_picture(folder.path / MOSAIC, mosaic, {cv2.IMWRITE_PNG_COMPRESSION: 1})
     write_picture(folder.path / PREVIEW, reduced(mosaic), JPEG)
     numbers = [number for number, _ in index.taken()]
-    folder.save(
-        index.model_copy(
-            update={
-                "mosaic": MosaicRecord.of(canvas, wanted.frame, gains),
-                "seams": [
-                    _seam([numbers[i], numbers[j]], one) for (i, j), one in sorted(seams.by_views.items())
-                ],
-                "whole": None if seams.whole is None else _seam([], seams.whole),
-                "slip": None if slip is None else _slip(slip, numbers),
-            }
-        )
-    )
+    numbered = [replace(one, views=tuple(numbers[at] for at in one.views)) for one in seams.by_views]
+    found = {
+        "mosaic": MosaicRecord.of(canvas, wanted.frame, gains),
+        "seams": numbered,
+        "whole": seams.whole,
+        "slip": None if slip is None else slip.numbered(numbers[slip.from_view]),
+    }
+    folder.save(index.model_copy(update=found))
 
 
 def so_far(folder: Folder) -> bytes:
@@ -139,20 +125,6 @@ def picture_at(folder: Folder, pixel_px: tuple[float, float], view: int | None =
     _, number, found, camera = best
     point = canvas.points(canvas.of_camera(camera, found))
     return Seen(number, found, float(np.linalg.norm(point - camera.ray(found).origins_m)))
-
-
-def _seam(views: list[int], error: SeamError) -> SeamRecord:
-    return SeamRecord(views=views, **as_json(error))
-
-
-def _slip(slip: Slip, numbers: list[int]) -> SlipRecord:
-    view = numbers[slip.from_view]
-    where = "in all views" if slip.from_view == 0 else f"from view {view} on"
-    size = f"{1e3 * slip.size_rad:+.2f} ± {1e3 * slip.sigma_rad:.2f} mrad"
-    return SlipRecord(
-        axis=slip.axis, from_view=view, size_rad=slip.size_rad, sigma_rad=slip.sigma_rad,
-        sentence=f"{slip.axis} truly stood {size} beside its reading {where}",
-    )  # fmt: skip
 
 
 def drawn(folder: Folder, now: CameraModel | None, points_m: Mapping[str, FloatArray]) -> PanoramaDrawn:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from scipy.optimize import least_squares
 
 from calib.errors import BadFile
 from calib.geometry.cahvor import CameraModel
@@ -26,8 +25,8 @@ XMP = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 </rdf:RDF></x:xmpmeta>
 <?xpacket end="w"?>"""
 JPEG_QUALITY = 92
-FIT_STEPS = 15
-"""Pixels across and down of which a lens is fitted."""
+FIT_STEPS, FIT_ROUNDS = 15, 6
+"""Pixels across and down of which a lens is fitted, and how often its focal length is."""
 
 
 def gpano(mosaic: Picture, canvas: Canvas, path: Path) -> None:
@@ -73,7 +72,7 @@ def hugin(cameras: Sequence[CameraModel], files: Sequence[str], canvas: Canvas, 
     of things at infinity. Its lens is fitted to the rays of the first camera. Raises BadFile.
     """
     width, height = cameras[0].size_px
-    lens, turn, worst_px = _hugin_lens(cameras[0])
+    lens, worst_px = _hugin_lens(cameras[0])
     names = "vabcde"
     fov = " ".join(f"{name}{value!r}" for name, value in zip(names, lens.tolist(), strict=True))
     w, h = canvas.size_px
@@ -88,7 +87,7 @@ def hugin(cameras: Sequence[CameraModel], files: Sequence[str], canvas: Canvas, 
     ]
     mosaic_from_rover = canvas.rover_from_mosaic.inverse
     for number, (camera, file) in enumerate(zip(cameras, files, strict=True)):
-        yaw, pitch, roll = _angles_deg(mosaic_from_rover.rotation @ _axes(camera) @ turn)
+        yaw, pitch, roll = _angles_deg(mosaic_from_rover.rotation @ _axes(camera))
         own = fov if not number else " ".join(f"{name}=0" for name in names)
         lines.append(
             f"i w{width} h{height} f0 {own} r{roll!r} p{pitch!r} y{yaw!r} "
@@ -118,40 +117,28 @@ def _full_height(canvas: Canvas, sphere: int) -> int:
     return 2 * math.ceil(max(above, canvas.size_px[1] - 1 - above) + 1.0)
 
 
-def _hugin_lens(camera: CameraModel) -> tuple[FloatArray, FloatArray, float]:
-    """Hugin's (v deg, a, b, c, d, e) of a camera, its axes in the camera's (3, 3), the worst misfit, px."""
+def _hugin_lens(camera: CameraModel) -> tuple[FloatArray, float]:
+    """Hugin's (v deg, a, b, c, d, e) of a camera, and the worst misfit, px: its wiki's polynomial and shift.
+
+    All but the focal length are linear, and that is the scale by which the rest comes out.
+    """
     width, height = camera.size_px
-    grid = np.stack(
-        np.meshgrid(np.linspace(0, width - 1, FIT_STEPS), np.linspace(0, height - 1, FIT_STEPS)), axis=-1
-    ).reshape(-1, 2)
-    local = camera.ray(grid).directions @ _axes(camera)
-
-    def off(parameters: FloatArray) -> FloatArray:
-        rays = local @ _turned(parameters[6:])
-        ideal = _hugin_pixels(parameters[:6], rays, camera.size_px)
-        return np.asarray((ideal - grid).ravel())
-
-    fov_deg = math.degrees(2.0 * math.atan(width / 2.0 / camera.focal_px[0]))
-    start = np.array([fov_deg, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    found = least_squares(off, start, x_scale=[1.0, 0.01, 0.01, 0.01, 1.0, 1.0, 1e-3, 1e-3, 1e-3], xtol=1e-14)
-    worst = float(np.abs(off(found.x)).max())
-    return found.x[:6], _turned(found.x[6:]), worst
-
-
-def _hugin_pixels(lens: FloatArray, rays: FloatArray, size_px: tuple[int, int]) -> FloatArray:
-    """Where Hugin's rectilinear lens has rays (n, 3) of camera axes: its wiki's polynomial and shift."""
-    fov_deg, a, b, c, d, e = lens
-    width, height = size_px
-    focal = width / 2.0 / math.tan(math.radians(fov_deg) / 2.0)
-    flat = focal * rays[:, :2] / rays[:, 2:]
-    part = np.linalg.norm(flat, axis=1, keepdims=True) / (min(width, height) / 2.0)
-    flat = flat * (a * part**3 + b * part**2 + c * part + (1.0 - a - b - c))
-    return np.asarray(flat + np.array([(width - 1) / 2.0 + d, (height - 1) / 2.0 + e]))
-
-
-def _turned(turn_rad: FloatArray) -> FloatArray:
-    rotation, _ = cv2.Rodrigues(turn_rad)
-    return np.asarray(rotation, dtype=np.float64)
+    axes = (np.linspace(0, side - 1, FIT_STEPS) for side in (width, height))
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    rays = camera.ray(grid).directions @ _axes(camera)
+    off, focal = (grid - np.array(camera.image_center_px)).ravel(), camera.focal_px[0]
+    found = columns = np.empty(0)
+    for _ in range(FIT_ROUNDS):
+        ideal = focal * rays[:, :2] / rays[:, 2:]
+        part = np.linalg.norm(ideal, axis=1, keepdims=True) / (min(width, height) / 2.0)
+        radial = [*(ideal * (part**power - 1.0) for power in (3, 2, 1)), ideal]
+        shift = np.tile(np.eye(2), (len(grid), 1))
+        columns = np.column_stack([*(one.ravel() for one in radial), shift])
+        found = np.linalg.lstsq(columns, off, rcond=None)[0]
+        focal *= found[3]
+    fov_deg = math.degrees(2.0 * math.atan(width / 2.0 / focal))
+    lens = np.concatenate([[fov_deg], found[:3], found[4:]])
+    return lens, float(np.abs(columns @ found - off).max())
 
 
 def _axes(camera: CameraModel) -> FloatArray:

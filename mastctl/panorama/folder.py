@@ -11,7 +11,7 @@ a daemon keeps beside it is in the folder, so it opens anywhere.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import lru_cache
 from pathlib import Path
@@ -29,7 +29,7 @@ from calib.files.yaml_text import dump_mapping
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.mosaic import Canvas, MosaicSurface, Projection
 from calib.geometry.rigid import Rigid
-from calib.matching.mosaic import Picture
+from calib.matching.mosaic import Picture, SeamError, Slip
 from mastctl.as_json import as_json
 from mastctl.devices.frames import StampedFrame
 from mastctl.frame_facts import FrameFacts
@@ -43,22 +43,11 @@ Count = Annotated[int, Field(ge=0, le=1_000_000)]
 
 
 class FrameRecord(Record):
-    """A picture of a view: its file, the SHA-256 of that, and the facts of a snapshot's headers."""
+    """A picture of a view: its file, the SHA-256 of that, and its facts."""
 
     file: Annotated[str, Field(pattern=r"^frames/[^/]+\.png$")]
     sha256: Text
-    frame_id: Text
-    sequence: Count
-    mid_exposure_s: Number
-    exposure_s: Number
-    pan_rad: Number
-    tilt_rad: Number
-    true_pan_rad: Number
-    true_tilt_rad: Number
-    pan_approach: Number
-    tilt_approach: Number
-    mast_digest: Text
-    settings: dict[str, float | None]
+    facts: FrameFacts
 
 
 class ViewRecord(Record):
@@ -90,54 +79,22 @@ class MosaicRecord(Record):
     def canvas(self) -> Canvas:
         """The mosaic's pixels as directions."""
         return Canvas(
-            self.projection,
-            self.px_per_rad,
-            self.azimuth_rad,
-            self.elevation_rad,
-            (self.size_px[0], self.size_px[1]),
-            Rigid(np.array(self.rotation), np.array(self.origin_m)),
+            self.projection, self.px_per_rad, self.azimuth_rad, self.elevation_rad,
+            (self.size_px[0], self.size_px[1]), Rigid(np.array(self.rotation), np.array(self.origin_m)),
             MosaicSurface.of(self.surface),
-        )
+        )  # fmt: skip
 
     @staticmethod
     def of(canvas: Canvas, frame: Literal["mast", "rover"], gains: Any) -> MosaicRecord:
         """Return the record of a canvas."""
-        return MosaicRecord(
-            projection=canvas.projection,
-            frame=frame,
-            surface=str(canvas.surface),
-            px_per_rad=float(canvas.px_per_rad),
-            azimuth_rad=float(canvas.azimuth_rad),
-            elevation_rad=float(canvas.elevation_rad),
-            size_px=list(canvas.size_px),
-            origin_m=canvas.origin_m.tolist(),
-            rotation=canvas.rover_from_mosaic.rotation.tolist(),
-            gains=None if gains is None else [float(one) for one in gains],
-        )
-
-
-class SeamRecord(Record):
-    """The error of a seam, or of all (no ``views``): rms of dx and dy, px, what the matches explain of it.
-
-    ``across_px``: rms across the parallax, which the scene's relief does not move, and the matches' own.
-    """
-
-    views: list[Count]
-    rms_px: Pair
-    sigma_px: Pair
-    across_px: Pair
-    count: Count
-    left_out: Count
-
-
-class SlipRecord(Record):
-    """A joint that read another angle from a view on, by what the seams say."""
-
-    axis: Literal["pan", "tilt"]
-    from_view: Count
-    size_rad: Number
-    sigma_rad: Number
-    sentence: str
+        facts = as_json(canvas)
+        pose = facts.pop("rover_from_mosaic")
+        facts |= {
+            "surface": str(canvas.surface),
+            "origin_m": pose["translation_m"],
+            "rotation": pose["rotation"],
+        }
+        return MosaicRecord(frame=frame, gains=as_json(gains), **facts)
 
 
 class Index(Record):
@@ -156,9 +113,9 @@ class Index(Record):
     reason: str = ""
     views: list[ViewRecord]
     mosaic: MosaicRecord | None = ABSENT
-    seams: list[SeamRecord] = Field(default_factory=list)
-    whole: SeamRecord | None = ABSENT
-    slip: SlipRecord | None = ABSENT
+    seams: list[SeamError] = Field(default_factory=list)
+    whole: SeamError | None = ABSENT
+    slip: Slip | None = ABSENT
 
     def taken(self) -> list[tuple[int, ViewRecord]]:
         """Return the views that the mosaic is made of, with their numbers."""
@@ -199,9 +156,7 @@ class Folder:
         file = f"frames/{number:03d}-{camera}.png"
         data = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
         write_whole(self.path / file, data)
-        facts = as_json(frame.facts)
-        wanted = {name: facts[name] for name in FrameRecord.model_fields if name in facts}
-        return FrameRecord(file=file, sha256=digest_of(data), **wanted)
+        return FrameRecord(file=file, sha256=digest_of(data), facts=frame.facts)
 
     def picture(self, frame: FrameRecord) -> Picture:
         """Return a view's picture. Raises BadFile if it is not the one that was taken."""
@@ -227,38 +182,22 @@ class Folder:
         record = self.index.views[number].frames[camera]
         image = self.picture(record)
         image.setflags(write=False)
-        names = {one.name for one in fields(FrameFacts)}
-        facts = {name: value for name, value in record.model_dump().items() if name in names}
-        return StampedFrame(**facts, camera=camera, moving=False, image=image)
+        facts = {one.name: getattr(record.facts, one.name) for one in fields(FrameFacts)}
+        return StampedFrame(**facts, image=image)
 
     def angles_rad(self) -> list[tuple[float, float]]:
         """Return true (pan, tilt) of each view that was taken."""
-        frames = [view.frames[self.index.cameras[0]] for _, view in self.index.taken()]
-        return [(frame.true_pan_rad, frame.true_tilt_rad) for frame in frames]
+        return [view.frames[self.index.cameras[0]].facts.true_rad for _, view in self.index.taken()]
 
     def cameras(self) -> list[CameraModel]:
         """Return the mosaic's camera at each view that was taken, in the rover frame."""
         name = self.index.cameras[0]
         return [self.mast.rig.camera_in_rover(name, *angles) for angles in self.angles_rad()]
 
-    def pictures(self) -> Pictures:
-        """Return the pictures of the mosaic's camera."""
-        return Pictures(self)
-
-
-class Pictures(Sequence[Picture]):
-    """The pictures of a mosaic's camera, read when they are needed; a few are kept. Raises BadFile."""
-
-    def __init__(self, folder: Folder) -> None:
-        name = folder.index.cameras[0]
-        self._frames = [view.frames[name] for _, view in folder.index.taken()]
-        self._read = lru_cache(PICTURES_KEPT)(lambda at: folder.picture(self._frames[at]))
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __getitem__(self, at: Any) -> Any:
-        return self._read(range(len(self))[at])
+    def pictures(self) -> Callable[[int], Picture]:
+        """Return what reads the mosaic's pictures, by their place in `cameras`; a few stay in memory."""
+        frames = [view.frames[self.index.cameras[0]] for _, view in self.index.taken()]
+        return lru_cache(PICTURES_KEPT)(lambda at: self.picture(frames[at]))
 
 
 def write_picture(path: Path, picture: Picture, options: Mapping[int, int] | None = None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import secrets
 import shutil
 import threading
@@ -66,6 +67,7 @@ class Panoramas:
         self._clock, self._operations = clock, operations
         self._so_far: tuple[str, int, bytes] | None = None
         self._newest: Index | None = None
+        self._begun_s: dict[str, float] = {}
         self._known: dict[str, tuple[int, Folder]] = {}  # as read last, with the time of the index
 
     def begin(self, body: Any, recorded: Mapping[str, Any]) -> Operation:
@@ -76,7 +78,7 @@ class Panoramas:
         is left of one that is refused.
         """
         with self._unchanged() as mast:
-            rig, limits = self._rig(), self._devices.judge.limits
+            rig, limits, began_s = self._rig(), self._devices.judge.limits, self._clock.now_s()
         if body.resume is not None:
             folder = Folder(self.open(body.resume).path)
             self._check_mast(folder, mast)
@@ -103,11 +105,13 @@ class Panoramas:
             with self._unchanged() as now:
                 if now is not mast:
                     raise NotNow("other_mast_file", "another mast file came into use meanwhile; try again")
-                return self._operations.start({**recorded, "panorama": folder.index.id}, run)
+                begun = self._operations.start({**recorded, "panorama": folder.index.id}, run)
         except BaseException:
             if body.resume is None:
                 shutil.rmtree(folder.path, ignore_errors=True)
             raise
+        self._begun_s[folder.index.id] = began_s
+        return begun
 
     def _planned(self, rig: Rig, body: Any, digest: str) -> Index:
         """The index of a panorama without views, as a request wants it."""
@@ -152,6 +156,10 @@ class Panoramas:
                 continue
         return {"panoramas": found}
 
+    def began_s(self, name: str) -> float:
+        """Return when one was begun, or gone on with, by this clock; -inf for one of an earlier run."""
+        return self._begun_s.get(name, -math.inf)
+
     def slip(self, mast_digest: str) -> str:
         """Return what the newest panorama's seams say against a mast file; '' for nothing. Reads no disk."""
         newest = self._newest
@@ -161,9 +169,7 @@ class Panoramas:
 
     def open(self, name: str) -> Folder:
         """Return one by its id. Raises NotKnown ``panorama_unknown``, Unable ``unreadable``."""
-        path = self._folder / name
-        if "/" in name or name.startswith(".") or not is_plain_file(path / INDEX):
-            raise NotKnown("panorama_unknown", f"this daemon has no panorama {name[:80]}")
+        path = self._path(name)
         try:
             mark = (path / INDEX).stat().st_mtime_ns
             known = self._known.get(name)
@@ -171,14 +177,17 @@ class Panoramas:
                 known = self._known[name] = mark, Folder(path)
             folder = known[1]
             if folder.index.state == "running" and not self._runs(name):
-                ended = {
-                    "state": "ended",
-                    "reason": "its end was not written: the daemon ended first, or the disk was full",
-                }
-                folder.index = folder.index.model_copy(update=ended)
+                reason = "its end was not written: the daemon ended first, or the disk was full"
+                folder.index = folder.index.model_copy(update={"state": "ended", "reason": reason})
             return folder
         except (BadFile, OSError) as error:
             raise Unable("unreadable", str(error)) from None
+
+    def _path(self, name: str) -> Path:
+        path = self._folder / name
+        if "/" in name or name.startswith(".") or not path.is_dir():
+            raise NotKnown("panorama_unknown", f"this daemon has no panorama {name[:80]}")
+        return path
 
     def _runs(self, name: str) -> bool:
         """Whether a panorama is being taken."""
@@ -190,9 +199,7 @@ class Panoramas:
 
         Raises NotKnown ``panorama_unknown``, NotNow ``busy`` while it is taken, Unable ``not_deleted``.
         """
-        path = self._folder / name
-        if "/" in name or name.startswith(".") or not path.is_dir():
-            raise NotKnown("panorama_unknown", f"this daemon has no panorama {name[:80]}")
+        path = self._path(name)
         if self._runs(name):
             raise NotNow("busy", f"panorama {name} is being taken; stop it first")
         try:
@@ -222,10 +229,6 @@ class Panoramas:
             except CalibError as error:
                 raise Unable("unreadable", str(error)) from None
         return drawn[2]
-
-    def camera_of(self, target: PanoramaTarget | None) -> str:
-        """Return the camera that a panorama's mosaic is of. Raises NotKnown, Unable."""
-        return self.open("" if target is None else target.id).index.cameras[0]
 
     def seen(self, target: PanoramaTarget) -> tuple[Seen, list[StampedFrame]]:
         """Return what a pixel shows, and its view's pictures, of the mosaic's camera first; reads the disk.

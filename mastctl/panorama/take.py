@@ -14,6 +14,7 @@ from calib.errors import BadFile, CalibError
 from calib.geometry.mosaic import BORDER_STEPS, border
 from calib.geometry.rig import Rig
 from drivers.errors import DriverError
+from mastctl.as_json import as_json
 from mastctl.devices.devices import Devices
 from mastctl.devices.judge import OutsideLimits
 from mastctl.devices.keep_out import KeptOut, Pair
@@ -107,7 +108,7 @@ class PanoramaTaker(Steps):
             with self.step("compose") as detail:
                 compose(folder, Composition(), self._pause)
                 whole, slip = folder.index.whole, folder.index.slip
-                detail.update(seams=None if whole is None else whole.model_dump())
+                detail.update(seams=None if whole is None else as_json(whole))
                 detail.update(slip=None if slip is None else slip.sentence)
         except BaseException as error:
             self.stop_whatever_happened()

@@ -309,10 +309,20 @@ class Service:
         track = (status or self.tracker.status).as_json(self.clock.now_s())
         return {**track, "self_check": self.handoffs.summary()}
 
-    def keep_target(
-        self, name: str, position_m: list[float], frame: str, covariance_m2: list[list[float]] | None
-    ) -> dict[str, KeptTarget]:
-        """Keep a target by a name and return all; in the site frame, if a pose is known."""
+    def keep_target(self, name: str, body: Any) -> dict[str, KeptTarget]:
+        """Keep a target by a name and return all; in the site frame, if a pose is known.
+
+        Raises NotKnown, NotNow if the operation measured no position, or the rover moved since.
+        """
+        position_m, frame, covariance_m2 = body.position_m, body.frame, body.covariance_m2
+        if body.operation is not None:
+            record, moved_s = self.operations.get(body.operation).as_json(), self.tracker.moved_s
+            position_m, frame = record["position_m"], "rover"
+            if position_m is None or (moved_s is not None and moved_s > record["created_s"]):
+                why = "measured no position" if position_m is None else "was before the rover moved"
+                raise NotNow("no_position", f"operation {body.operation} {why}; another pointing is expected")
+            measured = [one["detail"] for one in record["steps"] if one["name"] == "triangulate"]
+            covariance_m2 = measured[-1].get("covariance_m2") if measured else None
         pose = self.tracker.pose
         if frame == "rover" and pose is not None:
             frame, turned = "site", pose.site_from_rover
@@ -338,12 +348,13 @@ class Service:
 
         Raises NotKnown ``panorama_unknown``, Unable ``unreadable``, NotNow ``no_views``.
         """
-        folder, reading, moved_s = self.panoramas.open(name), self.devices.last_reading, self.tracker.moved_s
+        folder, reading = self.panoramas.open(name), self.devices.last_reading
         camera, rig = folder.index.cameras[0], self.stored.rig
-        if not (views := folder.index.taken()):
+        if not folder.index.taken():
             raise NotNow("no_views", f"panorama {name} has no view yet")
         now = rig.camera_in_rover(camera, *reading.true_rad) if reading and camera in rig.cameras else None
-        stands = moved_s is None or moved_s < views[0][1].frames[camera].mid_exposure_s
+        moved_s = self.tracker.moved_s
+        stands = moved_s is None or moved_s <= self.panoramas.began_s(name)
         return drawn(folder, now, {k: at for k, at, _ in self._targets_in_rover()} if stands else {})
 
     def _targets_in_rover(self) -> Iterator[tuple[str, FloatArray, Any]]:
@@ -519,7 +530,7 @@ def published_value(topic: Topic, value: Any, now_s: float) -> Any:
         case "fault":
             return [one.as_json(now_s) for one in value]
         case "frame":
-            return as_json(value) | {"age_s": max(0.0, now_s - value.mid_exposure_s)}
+            return as_json(value) | {"age_s": max(0.0, now_s - value.facts.mid_exposure_s)}
         case "operation":
             return value.as_json()
         case "command":  # without the key, by which others would get the answer, and a lease with it

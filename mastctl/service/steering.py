@@ -13,7 +13,7 @@ from drivers.clock import Clock
 from mastctl.answers import Preview
 from mastctl.control.operations import Operation, OperationRunner
 from mastctl.devices.devices import Devices
-from mastctl.devices.frames import StampedFrame, check_known
+from mastctl.devices.frames import check_known
 from mastctl.devices.judge import Limits
 from mastctl.errors import NotNow
 from mastctl.motion.loop import PointingLoop
@@ -112,7 +112,7 @@ class Steering:
         target = request.panorama
         if target is not None:
             seen, frames = self._panoramas.seen(target)
-            self._check_rover_stands(frames[0])
+            self._check_rover_stands(frames[0].camera, self._panoramas.began_s(target.id))
         with self._masts.unchanged():
             if target is not None:
                 request, _ = self._panoramas.pointed(request, seen, frames[0])
@@ -198,11 +198,11 @@ class Steering:
         find = partial(self._devices.frame_by_id, max_age_s=CLICK_AGE_S)
         frame = clicked_frame(target, self.rig, find)
         self._devices.hold(frame)  # until it has been found again, however many images are watched
-        self._check_rover_stands(frame)
+        self._check_rover_stands(frame.camera, frame.exposure_began_s)
 
-    def _check_rover_stands(self, frame: StampedFrame) -> None:
+    def _check_rover_stands(self, camera: str, exposure_began_s: float) -> None:
         """Refuse an image of another place of the rover. Raises NotNow ``rover_moved``."""
         moved_s = self._tracker.moved_s
-        if moved_s is not None and frame.exposure_began_s < moved_s:
-            message = f"the rover moved since this image of {frame.camera} was exposed; take another"
+        if moved_s is not None and exposure_began_s < moved_s:
+            message = f"the rover moved since this image of {camera} was exposed; take another"
             raise NotNow("rover_moved", message)

@@ -290,11 +290,21 @@ class PanoramaBody(StrictBody):
 
 
 class TargetBody(StrictBody):
-    """``POST /targets/{name}``: a point of the rover or site frame, and its covariance if it is known."""
+    """``POST /targets/{name}``: a point of the rover or site frame, and its covariance if it is known.
 
-    position_m: Place
+    Without ``position_m`` the one that ``operation`` measured, a pointing since which the rover stood.
+    """
+
+    position_m: Place | None = None
+    operation: Name | None = None
     frame: Literal["rover", "site"] = "rover"
     covariance_m2: Annotated[list[Place], Field(min_length=3, max_length=3)] | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> TargetBody:
+        if (self.position_m is None) == (self.operation is None):
+            raise ValueError("exactly one of position_m and operation is expected")
+        return self
 
 
 class FaultBody(StrictBody):

@@ -61,14 +61,14 @@ def add_pointing(app: FastAPI) -> None:
     @app.post(f"{PREFIX}/point/preview", summary="The point at a pixel, before anything moves")
     async def preview(body: PointRequest, here: Here) -> answers.Preview:
         service = here.service
-        if body.pixel is None and body.panorama is None:
-            raise BadRequest(
-                "bad_request", "pixel is missing; a preview is of a named frame's or a panorama's"
-            )
         if body.pixel is not None:
             camera = body.pixel.camera
-        else:  # the disk is read
-            camera = await here.waiting.run(lambda: service.panoramas.camera_of(body.panorama))
+        elif body.panorama is not None:  # the disk is read
+            name = body.panorama.id
+            camera = (await here.waiting.run(lambda: service.panoramas.open(name))).index.cameras[0]
+        else:
+            message = "pixel is missing; a preview is of a named frame's or a panorama's"
+            raise BadRequest("bad_request", message)
         service.check_camera(camera)
         cancelled = threading.Event()
         try:

@@ -42,9 +42,10 @@ def ours(canvas: Canvas, cameras: list[CameraModel], pictures: list[Picture]) ->
     """Compose and measure; the row of the table, and the seams."""
     began_s = time.process_time()
     owners, places = frames_of(canvas, cameras)
-    composed(pictures, owners, places, gains_of(canvas, cameras, pictures))
+    read = pictures.__getitem__
+    composed(read, owners, places, gains_of(canvas, cameras, read))
     took_s = time.process_time() - began_s
-    seams = seams_of(canvas, cameras, pictures)
+    seams = seams_of(canvas, cameras, read)
     off = np.array([patch.off_px for patch in seams.patches])
     return row("known angles", len(pictures), took_s, off, seams.patches), seams
 
@@ -114,8 +115,8 @@ def main() -> int:
     if args.panorama is None:
         cameras, pictures = flight_pictures()
     else:
-        folder = Folder(args.panorama)
-        cameras, pictures = folder.cameras(), list(folder.pictures())
+        cameras, read = (folder := Folder(args.panorama)).cameras(), folder.pictures()
+        pictures = [read(at) for at in range(len(cameras))]
     origin = Rigid(np.eye(3), np.mean([camera.C for camera in cameras], axis=0))
     canvas = canvas_of(cameras, origin, MosaicSurface.of(args.surface))
     known, seams = ours(canvas, cameras, pictures)

@@ -81,7 +81,8 @@ def taken(client: Client, state: Path) -> Folder:
 
 def true_angles(folder: Folder, rover: RoverModel) -> dict[int, tuple[float, float]]:
     """Where the joints truly stood at each view, by its number."""
-    return {at: rover.true_joints(view.frames[LEFT].mid_exposure_s) for at, view in folder.index.taken()}
+    views = folder.index.taken()
+    return {at: rover.true_joints(view.frames[LEFT].facts.mid_exposure_s) for at, view in views}
 
 
 def click(
@@ -128,8 +129,7 @@ def slipped(client: Client, before: Folder, axis: int) -> str:
     client.set_fault("pan_tilt", "wrong", offset_rad=-SLIP_RAD, axis=axis)
     client.wait(operation, timeout_s=WAITED_S)
     client.clear_faults()
-    slip = client.panorama(name).get("slip")
-    sentence = "none" if slip is None else slip["sentence"]
+    sentence = client.panorama(name).get("slip", {"sentence": "none"})["sentence"]
     return f"{('pan', 'tilt')[axis]} {1e3 * SLIP_RAD:+.2f} mrad: {sentence}"
 
 

@@ -55,13 +55,13 @@ def canvas(rig: Rig) -> tuple[Canvas, list[CameraModel]]:
 
 def slip_in(rig: Rig, pictures: list[Picture]) -> Slip | None:
     whole, cameras = canvas(rig)
-    return slip_of(rig, "navcam_left", ANGLES, whole, seams_of(whole, cameras, pictures).patches)
+    return slip_of(rig, "navcam_left", ANGLES, whole, seams_of(whole, cameras, pictures.__getitem__).patches)
 
 
 def test_each_pixel_shows_what_lies_in_its_direction(rig: Rig) -> None:
     whole, cameras = canvas(rig)
     owners, places = frames_of(whole, cameras)
-    mosaic = composed(shots(rig, ANGLES), owners, places)
+    mosaic = composed(shots(rig, ANGLES).__getitem__, owners, places)
     rows, columns = np.nonzero(owners != NOBODY)
     chosen = np.random.default_rng(1).integers(len(rows), size=5000)
     pixels = np.column_stack([columns[chosen], rows[chosen]]).astype(float)
@@ -85,14 +85,14 @@ def test_one_factor_a_picture_brings_their_brightness_together(rig: Rig) -> None
     whole, cameras = canvas(rig)
     factors = np.array([0.8, 1.0, 1.1, 0.9, 1.05, 0.95])
     pictures = [drawn(camera, factor) for camera, factor in zip(cameras, factors, strict=True)]
-    gains = gains_of(whole, cameras, pictures)
+    gains = gains_of(whole, cameras, pictures.__getitem__)
     level = gains * factors
     assert np.abs(level / level.mean() - 1.0).max() < 0.01
 
 
 def test_true_angles_leave_the_matchers_own_error(rig: Rig) -> None:
     whole, cameras = canvas(rig)
-    seams = seams_of(whole, cameras, shots(rig, ANGLES))
+    seams = seams_of(whole, cameras, shots(rig, ANGLES).__getitem__)
     assert seams.whole is not None and seams.whole.count > 25
     assert max(seams.whole.rms_px) < 0.05
     assert slip_of(rig, "navcam_left", ANGLES, whole, seams.patches) is None

@@ -280,9 +280,11 @@ def test_a_killed_daemons_panorama_goes_on_in_the_next(rover: Path, tmp_path: Pa
     """A kill leaves the index of the last view, whose state is still running; a picture may be damaged."""
     config = replace(load_config(rover), state_folder=tmp_path / "state")
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
+        operation = client.wait(client.point(position_m=(3.0, 0.0, 0.0)))["id"]
         _, index = taken(client)
         client.pose((1.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
         refused("rover_moved", lambda: preview(client, index))
+        refused("no_position", lambda: client.keep_target("rock", operation=operation))
     path = tmp_path / "state" / "panoramas" / index["id"]
     folder = Folder(path)
     views = [
@@ -303,10 +305,12 @@ def test_a_killed_daemons_panorama_goes_on_in_the_next(rover: Path, tmp_path: Pa
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
         refused("unknown_camera", lambda: client.take_panorama(resume=index["id"]))
         assert preview(client, index)["range_from"] == "surface"
-        assert (
-            client.request("DELETE", f"/panoramas/{index['id']}") == {"panoramas": []} and not path.exists()
-        )
-        refused("panorama_unknown", lambda: client.request("DELETE", f"/panoramas/{index['id']}"))
+        for x_m in (0.0, 1.0):
+            client.pose((x_m, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
+        refused("rover_moved", lambda: preview(client, index))
+        path_of = f"/panoramas/{index['id']}"
+        assert client.request("DELETE", path_of) == {"panoramas": []} and not path.exists()
+        refused("panorama_unknown", lambda: client.request("DELETE", path_of))
 
 
 def test_another_client_takes_the_lease_and_it_ends(client: Client, daemon: RunningDaemon) -> None:
@@ -374,6 +378,15 @@ def test_the_command_brings_the_folder_shows_composes_exports_and_points(
     clicked = picture_at(Folder(out), (200.0, 100.0)).pixel_px  # of this mosaic, not of the daemon's
     pixel = record["request"]["pixel"]
     np.testing.assert_allclose([pixel["x_px"], pixel["y_px"]], clicked, atol=1e-6)
+    kept = str(tmp_path / "targets")
+    assert main(["panorama", "keep", "stone", "--operation", record["id"], *url]) == 0
+    assert main(["panorama", "targets", "--out", f"{kept}.csv", *url]) == 0
+    assert main(["panorama", "targets", "--out", f"{kept}.json", *url]) == 0
+    header, row = Path(f"{kept}.csv").read_text().splitlines()
+    assert header.startswith("name,frame,x_m") and row.startswith("stone,site,") and "[[" in row
+    (feature,) = json.loads(Path(f"{kept}.json").read_text())["features"]
+    assert feature["properties"]["name"] == "stone" and feature["properties"]["covariance_m2"]
+    client.forget_target("stone")
     assert main(["point", "--panorama", str(out), "--pixel", "1", "2", "3", *url]) == 2
     assert "--panorama FOLDER --pixel X Y" in capsys.readouterr().err
 
