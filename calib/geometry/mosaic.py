@@ -237,14 +237,10 @@ def border(camera: CameraModel) -> FloatArray:
     """Return pixels (4 n, 2) around a camera's image: its upper, right, lower and left side, n each."""
     width, height = camera.size_px
     part = np.linspace(0.0, 1.0, BORDER_STEPS, endpoint=False)
-    x, y = part * (width - 1), part * (height - 1)
-    sides = [
-        np.column_stack([x, np.zeros_like(x)]),
-        np.column_stack([np.full_like(y, width - 1.0), y]),
-        np.column_stack([width - 1.0 - x, np.full_like(x, height - 1.0)]),
-        np.column_stack([np.zeros_like(y), height - 1.0 - y]),
-    ]
-    return np.concatenate(sides)
+    x, y, zero = part * (width - 1), part * (height - 1), np.zeros_like(part)
+    right, bottom = zero + width - 1.0, zero + height - 1.0
+    sides = (x, zero), (right, y), (right - x, bottom), (zero, bottom - y)
+    return np.concatenate([np.column_stack(side) for side in sides])
 
 
 def _middle_rad(directions: FloatArray) -> float:

@@ -121,8 +121,7 @@ def random_pixel(
 
 def slipped(client: Client, before: Folder, axis: int) -> str:
     """What the seams say where a reading is off from the middle view on."""
-    half = len(before.index.views) // 2
-    operation = client.take_panorama(pair="navcam", **FIELD)
+    operation, half = client.take_panorama(pair="navcam", **FIELD), len(before.index.views) // 2
     name = str(client.operation(operation)["request"]["panorama"])
     while sum(one["state"] == "taken" for one in client.panorama(name)["views"]) < half:
         client.advance(0.5)
