@@ -386,7 +386,7 @@ def test_the_command_brings_the_folder_shows_composes_exports_and_points(
     assert header.startswith("name,frame,x_m") and row.startswith("stone,site,") and "[[" in row
     (feature,) = json.loads(Path(f"{kept}.json").read_text())["features"]
     assert feature["properties"]["name"] == "stone" and feature["properties"]["covariance_m2"]
-    client.forget_target("stone")
+    client.request("DELETE", "/targets/stone")
     assert main(["point", "--panorama", str(out), "--pixel", "1", "2", "3", *url]) == 2
     assert "--panorama FOLDER --pixel X Y" in capsys.readouterr().err
 
