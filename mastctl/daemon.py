@@ -34,7 +34,7 @@ from mastctl.config import Config, Listen
 from mastctl.errors import MastctlError, Unable
 from mastctl.http.guard import EntryRules
 from mastctl.http.tokens import Access, TokenList
-from mastctl.http.waiting import Listener, SilentConnections, Streams, Waiting
+from mastctl.http.waiting import SilentConnections, Streams, Waiting
 from mastctl.logs import stall_while
 from mastctl.safety.state_folder import StateFolder
 from mastctl.service.service import Service
@@ -223,8 +223,8 @@ async def _serve(
     streams = Streams(service.machine.publisher)
     feeds = CameraFeeds(service.devices, service.clock)
     silent = SilentConnections()
-    app = silent.around(create_app(Parts(service, waiting, streams, entrance, feeds)))
-    server = uvicorn.Server(_settings(app))
+    app = create_app(Parts(service, waiting, streams, entrance, feeds))
+    server = uvicorn.Server(_settings(app, silent))
     ending = asyncio.Event()
 
     def end() -> None:
@@ -244,8 +244,6 @@ async def _serve(
         if signal.getsignal(signal.SIGTSTP) is not signal.SIG_IGN:
             loop.add_signal_handler(signal.SIGTSTP, _suspend, service)
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    if isinstance(listener, Listener):
-        listener.silent = silent
     serving = asyncio.create_task(server.serve(sockets=[listener]))
     while not server.started and not serving.done():
         await asyncio.sleep(0.005)
@@ -303,11 +301,11 @@ async def _report_state(service: Service, manager: ServiceManager) -> None:
                 manager.status(f"{now.state}: {now.reason}" if now.reason else now.state)
 
 
-def _settings(app: ASGIApp) -> uvicorn.Config:
+def _settings(app: ASGIApp, silent: SilentConnections) -> uvicorn.Config:
     """How uvicorn serves. Its limit of concurrent requests would refuse stops too, and is not set."""
     return uvicorn.Config(
         app,
-        http="h11",
+        http=silent.protocol,  # type: ignore[arg-type]
         h11_max_incomplete_event_size=LARGEST_HEADERS_BYTES,
         backlog=ACCEPTED_AT_ONCE,
         timeout_keep_alive=IDLE_S,
@@ -377,7 +375,7 @@ def _listening(listen: Listen) -> Iterator[tuple[socket.socket, str]]:
 def _tcp_socket(listen: Listen) -> socket.socket:
     family = socket.AF_INET6 if ":" in listen.host else socket.AF_INET
     # The protocol is named because asyncio switches Nagle's delay off only where it stands: 40 ms an answer.
-    listener = Listener(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         # Inherited by each connection, which a client that stops reading would otherwise keep for ever.

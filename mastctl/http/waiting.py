@@ -14,21 +14,18 @@ after a while, the oldest when they are many.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import os
 import resource
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from anyio import CancelScope, CapacityLimiter, move_on_after
 from anyio.to_thread import run_sync
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from drivers.clock import Clock, SystemClock
 from mastctl.control.publisher import LoopSubscription, Publisher, Topic
@@ -195,51 +192,38 @@ SILENT_S = 20.0  # twice as long as the server keeps a connection for its next r
 SWEEP_S = 1.0
 
 
-@dataclass(eq=False)
-class _Connection:
-    """A client's connection: when its client last sent, its whole requests under way, whether one ended."""
-
-    socket: socket.socket
-    since_s: float
-    requests: int = 0
-    served: bool = False
-
-    @property
-    def is_closed(self) -> bool:
-        return self.socket.fileno() < 0
-
-    @property
-    def has_bytes(self) -> bool:
-        """Whether its next request, or a part of one, waits to be read."""
-        try:
-            return bool(self.socket.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT))
-        except OSError:
-            return False
-
-
 class SilentConnections:
-    """The connections of a daemon, and which of them wait for their client: without a whole request.
+    """The connections that wait for their client, which owes a whole request: bounded in time and number.
 
-    ``most`` may wait, by default a quarter of the process' descriptors; those beyond are closed, those that
-    never had a whole request first. ``now_s`` is real time, since clients do not live in simulated time.
+    ``most`` of them may wait, by default a quarter of the process' descriptors. ``now_s`` is real time, since
+    clients do not live in simulated time.
     """
 
     def __init__(self, most: int | None = None, now_s: Callable[[], float] = time.monotonic) -> None:
         self._most = most
         self._now_s = now_s
-        self._by_client: dict[tuple[Any, ...], _Connection] = {}
+        self._seen: dict[H11Protocol, tuple[Any, float]] = {}
+        """Of each connection its newest request, and since when it waits."""
 
-    def add(self, connection: socket.socket, client: tuple[Any, ...]) -> None:
-        """Note a new connection; ``client`` is the host and port of the client, as ASGI states them."""
-        self._by_client[client] = _Connection(connection, self._now_s())
-        self._bound()
+    def protocol(self, **options: Any) -> H11Protocol:
+        """Return uvicorn's protocol for a new connection, after closing another one if too many wait.
+
+        It is what `uvicorn.Config` expects as ``http``.
+        """
+        most = self._most or max(resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4, 1)
+        if len(self._seen) >= most and len(waiting := self._waiting()) >= most:
+            # One that never had a request goes first, then the oldest.
+            self._close(min(waiting, key=lambda one: (one.cycle is not None, waiting[one])))
+        protocol = H11Protocol(**options)
+        self._seen[protocol] = None, self._now_s()
+        return protocol
 
     def close_old(self) -> None:
-        """Close connections on which nothing came for ``SILENT_S``; forget those that have ended."""
+        """Close connections that have waited for ``SILENT_S``."""
         latest_s = self._now_s() - SILENT_S
-        for client, one in list(self._by_client.items()):
-            if one.is_closed or (not one.requests and one.since_s <= latest_s and not one.has_bytes):
-                self._close(client)
+        for one, since_s in self._waiting().items():
+            if since_s <= latest_s:
+                self._close(one)
 
     async def watch(self) -> None:
         """Close old connections until the task is cancelled."""
@@ -247,69 +231,24 @@ class SilentConnections:
             await asyncio.sleep(SWEEP_S)
             self.close_old()
 
-    def around(self, app: ASGIApp) -> ASGIApp:
-        """Return an application that notes which connections have a whole request."""
+    def _waiting(self) -> dict[H11Protocol, float]:
+        """The open connections that wait for their client, and since when."""
+        waiting: dict[H11Protocol, float] = {}
+        for one, (request, since_s) in list(self._seen.items()):
+            now = one.cycle
+            if one.transport is None:  # not yet connected
+                continue
+            if one not in one.connections:  # closed, or a WebSocket
+                del self._seen[one]
+                continue
+            under_way = now is not None and not now.response_complete and not now.more_body
+            if under_way or now is not request:
+                since_s = self._now_s()
+                self._seen[one] = now, since_s
+            if not under_way:
+                waiting[one] = since_s
+        return waiting
 
-        async def noted(scope: Scope, receive: Receive, send: Send) -> None:
-            one = self._by_client.get(tuple(scope.get("client") or ()))
-            if one is None:  # of a Unix socket
-                await app(scope, receive, send)
-                return
-            whole = scope["type"] != "http"
-
-            async def part() -> Message:
-                nonlocal whole
-                if whole:
-                    return await receive()
-                self._waits(one)
-                try:
-                    message = await receive()
-                finally:
-                    one.requests += 1
-                whole = not message.get("more_body", False)
-                return message
-
-            one.requests += 1
-            try:
-                await app(scope, part, send)
-            finally:
-                one.served = True
-                self._waits(one)
-
-        return noted
-
-    def _waits(self, one: _Connection) -> None:
-        one.requests -= 1
-        one.since_s = self._now_s()
-        self._bound()
-
-    def _bound(self) -> None:
-        """Close one connection that waits for its client if these are too many."""
-        most = self._most or max(resource.getrlimit(resource.RLIMIT_NOFILE)[0] // 4, 1)
-        if len(self._by_client) <= most:
-            return
-        self.close_old()
-        silent = {client: one for client, one in self._by_client.items() if not one.requests}
-        if len(silent) > most:
-            for client in sorted(silent, key=lambda client: (silent[client].served, silent[client].since_s)):
-                if not silent[client].has_bytes:
-                    self._close(client)
-                    return
-
-    def _close(self, client: tuple[Any, ...]) -> None:
-        one = self._by_client.pop(client)
-        with contextlib.suppress(OSError):  # closed already
-            one.socket.shutdown(socket.SHUT_RDWR)
-
-
-class Listener(socket.socket):
-    """A listening TCP socket that notes each connection."""
-
-    silent: SilentConnections | None = None
-
-    def accept(self) -> tuple[socket.socket, Any]:
-        """Accept a connection, as `socket.socket.accept`."""
-        connection, address = super().accept()
-        if self.silent is not None:
-            self.silent.add(connection, tuple(address[:2]))
-        return connection, address
+    def _close(self, one: H11Protocol) -> None:
+        del self._seen[one]
+        one.transport.abort()

@@ -6,114 +6,104 @@ import asyncio
 import contextlib
 import resource
 import socket
-from collections.abc import Iterator
+from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+import uvicorn
+from uvicorn.server import ServerState
 
 from hil_tests.mastctl.outside_daemon import daemon_process, line, write_config
 from hil_tests.waiting import NET_S
 from mastctl.client import Client
 from mastctl.http.waiting import SILENT_S, SilentConnections
 
+pytestmark = pytest.mark.anyio
+HEAD = b"POST / HTTP/1.1\r\nHost: a\r\nContent-Length: 1\r\n\r\n"
+ALMOST_S = SILENT_S - 0.1
+
 
 @pytest.fixture
-def pair() -> Iterator[tuple[socket.socket, socket.socket]]:
-    ends = socket.socketpair()
-    with ends[0], ends[1]:
-        ends[1].setblocking(False)
-        yield ends
+def anyio_backend() -> str:
+    return "asyncio"
 
 
-def is_open(client: socket.socket) -> bool:
-    try:
-        return client.recv(1) != b""
-    except BlockingIOError:
-        return True
+class Served:
+    """uvicorn's protocol with these bounds, on a clock turned by hand; its answers wait to be released."""
 
+    def __init__(self, most: int | None = None) -> None:
+        self.now_s = 0.0
+        self.came, self.released = asyncio.Event(), asyncio.Event()
+        self.silent = SilentConnections(most, lambda: self.now_s)
 
-def test_a_whole_request_keeps_its_connection_and_its_end_begins_the_time_anew(
-    pair: tuple[socket.socket, socket.socket],
-) -> None:
-    now_s = 0.0
-    silent = SilentConnections(now_s=lambda: now_s)
-    parts = iter([True, True, False])
-
-    async def receive() -> Any:  # an upload of three parts, each of which comes just in time
-        nonlocal now_s
-        now_s += SILENT_S - 0.1
-        silent.close_old()
-        assert is_open(pair[1])
-        return {"type": "http.request", "body": b"1", "more_body": next(parts)}
-
-    async def app(_: Any, receive: Any, __: Any) -> None:
-        while (await receive())["more_body"]:
+    async def app(self, scope: Any, receive: Any, send: Any) -> None:
+        self.came.set()
+        while (await receive()).get("more_body"):
             pass
-        nonlocal now_s
-        now_s += 10 * SILENT_S
-        silent.close_old()
-        assert is_open(pair[1])
+        await self.released.wait()
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"0")]})
+        await send({"type": "http.response.body", "body": b""})
 
-    silent.add(pair[0], ("a", 1))
-    asyncio.run(silent.around(app)({"type": "http", "client": ("a", 1)}, receive, None))  # type: ignore[arg-type]
-    silent.close_old()
-    assert is_open(pair[1])
-    now_s += SILENT_S
-    silent.close_old()
-    assert not is_open(pair[1])
+    @contextlib.asynccontextmanager
+    async def port(self) -> AsyncIterator[int]:
+        config, state = uvicorn.Config(self.app, interface="asgi3", log_config=None), ServerState()
+        loop = asyncio.get_running_loop()
+        async with await loop.create_server(
+            lambda: self.silent.protocol(config=config, server_state=state, app_state={}), "127.0.0.1", 0
+        ) as server:
+            yield server.sockets[0].getsockname()[1]
 
-
-def test_a_request_that_begins_before_the_one_before_has_returned_is_under_way(
-    pair: tuple[socket.socket, socket.socket],
-) -> None:
-    now_s = 0.0
-    silent = SilentConnections(now_s=lambda: now_s)
-    silent.add(pair[0], ("a", 1))
-    scope: Any = {"type": "http", "client": ("a", 1)}
-
-    async def both() -> None:
-        answered, over = asyncio.Event(), asyncio.Event()
-
-        async def first(*_: Any) -> None:
-            await answered.wait()
-
-        async def second(*_: Any) -> None:
-            await over.wait()
-
-        stream: Any = None
-        former = asyncio.ensure_future(silent.around(first)(scope, stream, stream))
-        await asyncio.sleep(0)
-        later = asyncio.ensure_future(silent.around(second)(scope, stream, stream))
-        answered.set()
-        await former
-        nonlocal now_s
-        now_s = 2 * SILENT_S
-        silent.close_old()
-        assert is_open(pair[1])
-        over.set()
-        await later
-
-    asyncio.run(both())
+    def later(self, duration_s: float) -> None:
+        self.silent.close_old()
+        self.now_s += duration_s
+        self.silent.close_old()
 
 
-@pytest.mark.parametrize(("kind", "stays"), [("new", False), ("served", True), ("next request", True)])
-def test_of_too_many_those_without_any_request_are_closed_first(kind: str, stays: bool) -> None:
-    async def app(*_: Any) -> None:
-        pass
+async def is_open(reader: asyncio.StreamReader) -> bool:
+    with contextlib.suppress(ConnectionError, TimeoutError):
+        async with asyncio.timeout(0.05):
+            return await reader.read(1) != b""
+    return reader.exception() is None
 
-    silent = SilentConnections(most=1)
-    with contextlib.ExitStack() as stack:
-        ends = [stack.enter_context(one) for _ in range(2) for one in socket.socketpair()]
-        for end in ends:
-            end.setblocking(False)
-        silent.add(ends[0], ("a", 1))
-        if kind == "served":
-            asyncio.run(silent.around(app)({"type": "http", "client": ("a", 1)}, None, None))  # type: ignore[arg-type]
-        if kind == "next request":
-            ends[1].send(b"GET")
-        silent.add(ends[2], ("a", 2))
-        assert (is_open(ends[1]), is_open(ends[3])) == (stays, not stays)
+
+async def test_a_client_has_a_time_for_headers_for_a_body_and_for_its_next_request() -> None:
+    served = Served()
+    async with served.port() as port:
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(HEAD[:9])
+        assert await is_open(reader)
+        served.later(ALMOST_S)
+        writer.write(HEAD[9:])
+        await asyncio.wait_for(served.came.wait(), NET_S)
+        served.later(ALMOST_S)
+        writer.write(b"x")
+        assert await is_open(reader)
+        served.later(10 * SILENT_S)
+        assert await is_open(reader), "it waits for the answer, not for its client"
+        served.released.set()
+        await reader.readuntil(b"\r\n\r\n")
+        served.later(ALMOST_S)
+        assert await is_open(reader)
+        served.later(SILENT_S - ALMOST_S)
+        assert not await is_open(reader)
+
+
+@pytest.mark.parametrize("request_before", [False, True])
+async def test_of_too_many_those_without_any_request_are_closed_first(request_before: bool) -> None:
+    served = Served(most=2)
+    served.released.set()
+    async with served.port() as port:
+        first, writer = await asyncio.open_connection("127.0.0.1", port)
+        if request_before:
+            writer.write(HEAD + b"x")
+            await first.readuntil(b"\r\n\r\n")
+        second, _kept = await asyncio.open_connection("127.0.0.1", port)
+        assert await is_open(second)
+        served.now_s += 1.0
+        third, _kept_too = await asyncio.open_connection("127.0.0.1", port)
+        stay = [await is_open(one) for one in (first, second, third)]
+        assert stay == [request_before, not request_before, True]
 
 
 @pytest.mark.parametrize(
