@@ -19,8 +19,7 @@ from mastctl.bench.run import BenchRun, Reporter
 from mastctl.bench.survey import fit_in_frame
 from mastctl.calibration.drawn import cells_seen
 from mastctl.calibration.landing import expected_pointing
-from mastctl.calibration.mast_file import fit_document, picked, with_fit
-from mastctl.calibration.run import checked_survey, conclude
+from mastctl.calibration.run import checked_survey, conclude, fit_document, picked, with_fit
 from mastctl.calibration.verdict import CalibrationVerdict, judge
 from mastctl.report.pages import Table
 

@@ -7,14 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from calib.adjust.result import BenchCalibration, Calibration, FittedRig, ImageResiduals
+from calib.adjust.result import BenchCalibration, FittedRig, ImageResiduals
 from calib.geometry.covariance import RigCovariance
-from calib.geometry.parameters import predict
 from calib.geometry.rig import JOINTS_NAMES, AxisJoint, Rig
-from calib.geometry.rigid import FloatArray, Rigid
+from calib.geometry.rigid import FloatArray
 from calib.plan.knowledge import ExpectedPointing
 from calib.survey.records import Survey
-from calib.targets.boards import Board
 from mastctl.report import pictures
 
 CELLS = (16, 12)
@@ -132,30 +130,6 @@ def joint_curves(fit: BenchCalibration, survey: Survey) -> Any:
     return figure
 
 
-def lens_uncertainty(fit: FittedRig, cameras: Sequence[str], range_m: float = 5.0) -> Any:
-    """Draw how sure projection is over each image, 95 %, of a point of the head ``range_m`` away."""
-    figure, axes = _image_of_each(fit.rig, cameras)
-    covariance = np.asarray(fit.covariance)
-    for axis, name in zip(axes, cameras, strict=True):
-        model = fit.rig.cameras[name].model
-        width, height = model.size_px
-        columns, rows = 24, max(2, round(24 * height / width))
-        x, y = np.meshgrid(
-            (np.arange(columns) + 0.5) * width / columns, (np.arange(rows) + 0.5) * height / rows
-        )
-        rays = model.ray(np.stack([x.ravel(), y.ravel()], axis=-1))
-        rates = predict(model, rays.origins_m + range_m * rays.directions).d_step
-        mine = fit.part(f"cameras.{name}.")
-        variance = np.einsum("nip,pq,niq->n", rates, covariance[np.ix_(mine, mine)], rates) / 2.0
-        sigma = np.sqrt(np.maximum(variance, 0.0)).reshape(rows, columns)
-        shown = axis.imshow(
-            1.96 * sigma, extent=(-0.5, width - 0.5, height - 0.5, -0.5), cmap="viridis", vmin=0
-        )
-        figure.colorbar(shown, ax=axis, label="95 %, px", shrink=0.85)
-        axis.set_title(name, fontsize=10)
-    return figure
-
-
 def workspace(aim: ExpectedPointing, covariance: FloatArray, fit: FittedRig) -> Any:
     """Draw the predicted pointing error over pan and tilt, by range, with the attitudes of the images."""
     squares = np.einsum("ip,pq,iq->i", aim.to_rig, covariance, aim.to_rig).reshape(-1, 2).mean(axis=1)
@@ -181,40 +155,6 @@ def workspace(aim: ExpectedPointing, covariance: FloatArray, fit: FittedRig) -> 
         axis.set_ylim(np.degrees(tilts[0]), np.degrees(tilts[-1]))
     axes[0].set_ylabel("tilt, deg")
     figure.colorbar(shown, ax=axes, label="first pointing, rms an axis, px")
-    return figure
-
-
-def boards(fit: Calibration, board: Board) -> Any:
-    """Draw every board and camera in the rover frame, from above and from the side."""
-    figure = pictures.new_plot(10.5, 5.2)
-    plan, side = figure.subplots(1, 2)
-    corners = board.dots_in_board_m(
-        [0, 0, board.rows - 1, board.rows - 1, 0], [0, board.columns - 1, board.columns - 1, 0, 0]
-    )
-    purposes: dict[tuple[str, str], str] = {}
-    for image in fit.images:
-        purposes.setdefault((image.setup, image.placement), image.purpose)
-    colour_of = {"camera": pictures.BLUE, "mast": pictures.GREEN, "check": pictures.RUST}
-    views = ((plan, (1, 0)), (side, (0, 2)))
-    labels = {purpose: f"boards: {purpose}" for purpose in colour_of}
-    for key, pose in fit.rover_from_board.items():
-        purpose, outline = purposes.get(key, "camera"), pose.points(corners)
-        label = labels.pop(purpose, None)
-        for axis, (across, up) in views:
-            axis.plot(outline[:, across], outline[:, up], color=colour_of[purpose], lw=1.5, label=label)
-    for index, camera in enumerate(fit.rig.cameras):
-        model = fit.rig.camera_in_rover(camera, 0.0, 0.0)
-        ahead = Rigid(np.eye(3), model.C).points(0.8 * np.asarray(model.A))
-        label = "cameras at pan 0, tilt 0" if index == 0 else None
-        for axis, (across, up) in views:
-            axis.plot([model.C[across], ahead[across]], [model.C[up], ahead[up]], "k-", lw=1, label=label)
-            axis.plot(model.C[across], model.C[up], "k.", ms=4)
-    plan.set(xlabel="y (right), m", ylabel="x (ahead), m", title="from above", aspect="equal")
-    side.set(xlabel="x (ahead), m", ylabel="z (down), m", title="from the right side", aspect="equal")
-    side.invert_yaxis()
-    for axis in (plan, side):
-        axis.grid(alpha=0.25)
-    plan.legend(fontsize=7, loc="best")
     return figure
 
 

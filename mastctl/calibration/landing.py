@@ -1,4 +1,4 @@
-"""Where a target lands that a rig points at, by another rig or its uncertainty; how far two rigs differ.
+"""Where a target lands that a rig points at, by another rig or its uncertainty.
 
 A pointing as the daemon does it: two pixels of a stereo pair, triangulated and pointed at by the believed
 rig. Where the target lands then is by the true one. The paper's sections IV and V, without a renderer.
@@ -6,22 +6,18 @@ rig. Where the target lands then is by the true one. The paper's sections IV and
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from calib.adjust.result import FittedRig
 from calib.errors import CalibError
-from calib.geometry.cahvor import CameraModel
 from calib.geometry.covariance import RigCovariance
-from calib.geometry.parameters import predict
 from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig
-from calib.geometry.rigid import FloatArray, Rigid, moved_rigid
+from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import triangulate
 from calib.plan.knowledge import ExpectedPointing, Knowledge, Workspace, pointing
 from mastctl.errors import MastctlError
@@ -33,10 +29,6 @@ NEAR_CORNER = (0.2, 0.2)
 
 PANS_RAD, TILTS_RAD = (-2.0, -1.0, 0.0, 1.0, 2.0), (-0.9, -0.4, 0.1, 0.6)
 """Joint angles at which two rigs are compared."""
-
-GRID = (13, 10)
-RANGES_M = (2.0, 20.0)
-"""Pixels of an image and ranges at which two cameras are compared."""
 
 
 def click(
@@ -145,6 +137,7 @@ def first_cameras(rig: Rig) -> tuple[str, ...]:
     raise MastctlError("the mast file has no camera on the head, and so no head to calibrate")
 
 
+@lru_cache(4)
 def expected_pointing(
     fit: FittedRig, cameras: tuple[str, ...] | None = None, middle: bool = False
 ) -> tuple[ExpectedPointing, FloatArray] | None:
@@ -152,14 +145,16 @@ def expected_pointing(
 
     Over the angles at which boards were seen, targets at 2, 6 and 10 m, clicked in these cameras, by default
     the first (one camera gets the range); with ``middle`` only amid those angles, `POINTING_RANGE_M` away.
-    None if nothing can be pointed at.
+    None if nothing can be pointed at. The last are kept: verdict, report and result of a bench need the same.
     """
     readings = np.array([(i.pan_rad, i.tilt_rad) for i in fit.images if i.pan_rad is not None], dtype=float)
     known, names = Knowledge(fit.rig, {}), cameras or first_cameras(fit.rig)
-    ends = (np.median(readings, axis=0),) * 2 if middle else (readings.min(axis=0), readings.max(axis=0))
-    (low_pan, low_tilt), (high_pan, high_tilt) = (one.tolist() for one in ends)
-    where = Workspace(names, (low_pan, high_pan), (low_tilt, high_tilt))
-    where = replace(where, ranges_m=(POINTING_RANGE_M,)) if middle else where
+    if middle:
+        pan, tilt = np.median(readings, axis=0).tolist()
+        where = Workspace(names, (pan, pan), (tilt, tilt), ranges_m=(POINTING_RANGE_M,))
+    else:
+        (low_pan, low_tilt), (high_pan, high_tilt) = readings.min(axis=0), readings.max(axis=0)
+        where = Workspace(names, (float(low_pan), float(high_pan)), (float(low_tilt), float(high_tilt)))
     try:
         landings = pointing(known, where)
     except CalibError:
@@ -203,60 +198,3 @@ def pointing_change(new: Rig, old: Rig) -> dict[str, dict[str, float]]:
                 "position_most_px": float(np.max(placed)),
             }
     return found
-
-
-def rig_differences(new: Rig, former: Rig) -> Iterator[str]:
-    """Yield how each camera that both rigs have, of the same size and mount, differs: by a motion and a lens.
-
-    The motion makes the former camera project as the new one does, as well as one can. The lens differs by
-    new less former pixel of what the former saw far away, the motion taken out.
-    """
-    for name, camera in new.cameras.items():
-        old = former.cameras.get(name)
-        if old is None or old.on != camera.on or old.model.size_px != camera.model.size_px:
-            continue
-        moved = implied_motion(camera.model, old.model)
-        pixels, far = _seen_grid(old.model, RANGES_M[-1:])
-        now, valid = camera.model.project(moved.points(far))
-        rms_px = (
-            float(np.sqrt(np.mean(np.sum((now - pixels)[valid] ** 2, axis=1)))) if valid.any() else np.nan
-        )
-        # Points moved into the camera's place: the camera moved the other way.
-        turn = -1e3 * Rotation.from_matrix(moved.rotation).as_rotvec()
-        shift = 1e3 * moved.inverse.translation_m
-        unseen = 100 * float(1.0 - valid.mean())
-        yield (
-            f"{name}: turned by {turn[0]:+.2f}, {turn[1]:+.2f}, {turn[2]:+.2f} mrad about x, y, z "
-            f"and shifted by {shift[0]:+.1f}, {shift[1]:+.1f}, {shift[2]:+.1f} mm; "
-            f"its lens differs by {rms_px:.2f} px rms"
-            + (f"; {unseen:.0f} % of what it saw has no pixel any more" if unseen else "")
-        )
-
-
-def implied_motion(new: CameraModel, former: CameraModel) -> Rigid:
-    """Return the motion of points after which a camera sees them as its former model saw them before.
-
-    By least squares over all of its image.
-    """
-    turn = new.rotation.T @ former.rotation
-    start = Rigid(turn, new.C - turn @ former.C)
-    pixels, points = _seen_grid(former, RANGES_M)
-
-    def off_px(step: FloatArray) -> FloatArray:
-        off = predict(new, moved_rigid(start, step).points(points)).pixels_px - pixels
-        return np.nan_to_num(off.ravel(), posinf=0.0, neginf=0.0)
-
-    return moved_rigid(start, least_squares(off_px, np.zeros(6), xtol=1e-12, ftol=1e-12, gtol=1e-12).x)
-
-
-def _seen_grid(camera: CameraModel, ranges_m: Sequence[float]) -> tuple[FloatArray, FloatArray]:
-    """Pixels (n, 2) over a camera's picture, and points (n, 3) seen there, range after range."""
-    width, height = camera.size_px
-    x, y = np.meshgrid(
-        (np.arange(GRID[0]) + 0.5) * width / GRID[0] - 0.5,
-        (np.arange(GRID[1]) + 0.5) * height / GRID[1] - 0.5,
-    )
-    pixels = np.stack([x.ravel(), y.ravel()], axis=-1)
-    rays = camera.ray(pixels)
-    points = [rays.origins_m + range_m * rays.directions for range_m in ranges_m]
-    return np.concatenate([pixels] * len(ranges_m)), np.concatenate(points)

@@ -24,7 +24,7 @@ from calib.files.yaml_text import plain
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
 from calib.matching.handoff import MatchedHandoff, handoff_bias
-from mastctl.calibration.mast_file import made, picked, rounded_matrix
+from mastctl.calibration.run import made, picked, rounded_matrix
 from mastctl.watch.handoffs import ReadLog, bias_record
 
 SHIFT_FIRST = (3, 4, 5, 0, 1, 2)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from calib.adjust.hypotheses import Finding
 from calib.adjust.result import HELD_FIXED, BenchCalibration, Calibration, FittedRig
 from calib.files import save_bytes
 from calib.files.mast_file import StoredRig
@@ -15,12 +16,10 @@ from calib.geometry.rig import Rig
 from calib.survey.records import Survey
 from mastctl.as_json import readable
 from mastctl.calibration import drawn
-from mastctl.calibration.landing import expected_pointing, pointing_change, rig_differences
-from mastctl.calibration.sigmas import finding_table, sigma_table
-from mastctl.calibration.verdict import CalibrationVerdict
+from mastctl.calibration.landing import expected_pointing, pointing_change
+from mastctl.calibration.verdict import CalibrationVerdict, stated
 from mastctl.report import pages, pictures
 from mastctl.report.pages import Table, number, x_y
-from mastctl.report.pictures import Figure
 
 AnyFit = Calibration | BenchCalibration
 
@@ -52,6 +51,12 @@ def write_report(
         method = f"{fit.method}, {fit.mast_parameters} mast parameters"
         wider, station = finding_table("wider model", fit.wider), _station_table(fit)
         parts = {"terms": None, "wider": wider, "station": station}
+    plots = None
+    if pictures.can_plot():
+        plots = [
+            (heading, pictures.plot(figure, alt, caption, "map" if alt.startswith("maps") else "lines"))
+            for heading, figure, alt, caption in _drawings(survey, fit)
+        ]
     date = str(saved.rig.provenance.get("date", "")).replace("T", " ").replace("+00:00", " UTC")
     page = pages.page(
         "calibration.html",
@@ -73,7 +78,7 @@ def write_report(
         notes=fit.notes,
         held_fixed=fit.gauges if isinstance(fit, BenchCalibration) else HELD_FIXED,
         left_out=[outlier.sentence for outlier in fit.outliers],
-        plots=list(_plots(survey, fit)) if pictures.can_plot() else None,
+        plots=plots,
         changes=[] if former is None else list(_changes(fit.rig, former)),
         worst_images=_worst_images(fit),
         **parts,
@@ -125,13 +130,44 @@ def camera_table(fit: FittedRig, promised_px: Mapping[str, float] | None = None)
     return Table((*headings, *([] if promised_px is None else ["promised px"])), rows)
 
 
-def _plots(survey: Survey, fit: AnyFit) -> Iterable[tuple[str, Figure]]:
-    """Every plot, with its heading."""
-    for heading, figure, alt, caption in _drawn(survey, fit):
-        yield heading, pictures.plot(figure, alt, caption, "map" if alt.startswith("maps") else "lines")
+def sigma_table(survey: Survey, fit: FittedRig) -> Table | None:
+    """Return stated and found sigma of each kind, or None where the method does not weigh by them."""
+    if not fit.components:
+        return None
+    rows = []
+    for c in fit.components:
+        sigma, unit, _ = stated(survey, fit.images, c.kind)
+        found = f"{c.factor * sigma:.3g} ± {c.factor_sigma * sigma:.1g} {unit}"
+        rows.append(
+            [
+                c.kind,
+                f"{sigma:.3g} {unit}",
+                found if np.isfinite(c.factor) else "not determined",
+                f"{c.redundancy:.0f} of {c.count}",
+                f"{c.weighed:.2f}",
+            ]
+        )
+    return Table(("measurements", "stated sigma", "found", "redundant numbers", "taken times"), rows)
 
 
-def _drawn(survey: Survey, fit: AnyFit) -> Iterable[tuple[str, Any, str, str]]:
+def finding_table(heading: str, findings: Sequence[Finding], most: int | None = None) -> Table | None:
+    """Return what hypotheses would gain, or None where none was tested."""
+    if not findings:
+        return None
+    rows = [
+        [
+            one.name,
+            f"{one.numbers}",
+            f"{one.gain:.1f}",
+            f"{one.chance:.2g}",
+            one.sentence if one.significant else "no more than chance",
+        ]
+        for one in findings[:most]
+    ]
+    return Table((heading, "numbers", "gain in chi-square", "chance", ""), rows)
+
+
+def _drawings(survey: Survey, fit: AnyFit) -> Iterable[tuple[str, Any, str, str]]:
     """Heading, figure, what it shows for those who cannot see it, caption."""
     cameras = [name for name in fit.rig.cameras if any(i.camera == name for i in fit.images)]
     yield (
@@ -161,19 +197,6 @@ def _drawn(survey: Survey, fit: AnyFit) -> Iterable[tuple[str, Any, str, str]]:
             "true less read angle over each joint's reading",
             "The fitted curve with its 95 % band, and what each image says of it (one point an image).",
         )
-    else:
-        yield (
-            "Where the boards stood",
-            drawn.boards(fit, survey.board),
-            "boards in plan and side view",
-            "In the rover frame, so boards that the rover saw while it was tilted back stand low.",
-        )
-    yield (
-        "How sure projection is over the images",
-        drawn.lens_uncertainty(fit, cameras),
-        "maps of the uncertainty of projection",
-        "95 % of a pixel of a target 5 m away.",
-    )
     expected = expected_pointing(fit)
     if expected is not None:
         yield (
@@ -185,8 +208,7 @@ def _drawn(survey: Survey, fit: AnyFit) -> Iterable[tuple[str, Any, str, str]]:
 
 
 def _changes(rig: Rig, former: Rig) -> Iterable[str]:
-    """By how much cameras and pointing differ from the former mast file."""
-    yield from rig_differences(rig, former)
+    """By how much pointing differs from the former mast file."""
     for pair, change in pointing_change(rig, former).items():
         yield (
             f"pointing {pair} at what was clicked would change by {change['median_px']:.2f} px, at most "

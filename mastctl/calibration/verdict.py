@@ -12,12 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from calib.adjust.noise import Component, as_one
 from calib.adjust.result import BenchCalibration, Calibration, FittedRig, ImageResiduals
-from calib.adjust.terms import PRISMS, TAPES
+from calib.adjust.terms import DOTS_OF, DRAWING, JOINTS, PRISMS, TAPES
 from calib.errors import CalibError
 from calib.geometry.significance import Level
 from calib.survey.records import Survey, SurveyFinding
 from mastctl.calibration.landing import expected_pointing, head_cameras
-from mastctl.calibration.sigmas import OWN, order_px, stated
 
 Grade = Literal["good", "care", "bad"]
 
@@ -55,6 +54,10 @@ CLOSER = 0.1
 
 FAR_PX = 20.0
 """The same where the image's own board has no pixels to compare with."""
+
+
+OWN = "their own sigmas"
+"""What states a sigma that dots or corners came with, each its own; shown is the median."""
 
 
 @dataclass(frozen=True)
@@ -159,7 +162,7 @@ def _of_bench(survey: Survey, fit: BenchCalibration) -> Iterator[Reason]:
 def _noise(survey: Survey, fit: Calibration | BenchCalibration) -> list[Reason]:
     """Whether the residuals are what the stated sigmas make them."""
     if isinstance(fit, BenchCalibration) or np.isfinite(fit.chi2_probability):
-        return [_chi_square(fit), *_sigmas(survey, fit), *_no_more_than_stated(fit)]
+        return [_chi_square(fit), *_sigmas(survey, fit)]
     worst_px, camera = max((max(xy), name) for name, xy in fit.rms_px.items())
     sentence = f"the largest residual of the fitted images is {worst_px:.2f} px rms ({camera})"
     if worst_px > PAPER_GOOD_PX:
@@ -167,18 +170,6 @@ def _noise(survey: Survey, fit: Calibration | BenchCalibration) -> list[Reason]:
         why = "the mast is not upright: use --mast 6" if upright else "station and boards do not agree"
         return [Reason("bad", f"{sentence}: {why}")]
     return [Reason("good", f"{sentence}, within what station errors of some mm leave")]
-
-
-def _no_more_than_stated(fit: FittedRig) -> list[Reason]:
-    known = [c for c in fit.components if np.isfinite(c.factor)]
-    if not known or any(c.wrong for c in fit.components):
-        return []
-    most = max(known, key=lambda c: c.factor)
-    sentence = (
-        f"each kind of measurement scatters no more than stated, most of all {most.kind}: "
-        f"{most.factor:.2f} ± {most.factor_sigma:.2f} times their sigma"
-    )
-    return [Reason("good", sentence)]
 
 
 def _chi_square(fit: FittedRig) -> Reason:
@@ -197,6 +188,28 @@ def _chi_square(fit: FittedRig) -> Reason:
         f"chi-square is {fit.chi2:.0f} for {freedom:.0f} degrees of freedom: the residuals are "
         f"{factor:.2f} times what the stated sigmas make them",
     )
+
+
+def stated(survey: Survey, images: Sequence[ImageResiduals], kind: str) -> tuple[float, str, str]:
+    """Return the stated sigma of a kind of measurement, its unit, and its key under sigma in survey.yaml, or
+    `OWN`."""
+    sigma = survey.sigma
+    if kind.startswith(DOTS_OF):
+        camera, key = kind.removeprefix(DOTS_OF), "corner_px" if survey.boards else "dot_px"
+        own = [image.sigma_px for image in images if image.camera == camera and image.purpose != "check"]
+        own_px = float(np.median(np.concatenate(own))) if own else order_px(survey)
+        same = own_px == order_px(survey)
+        return own_px, "px", key if same else OWN
+    if kind == JOINTS:
+        return 1e3 * sigma.joint_rad, "mrad", "joint_rad"
+    if kind == DRAWING:
+        return 1e3 * sigma.prism_cad_m, "mm", "prism_cad_m"
+    return 1e3 * sigma.station_m, "mm", "station_m"
+
+
+def order_px(survey: Survey) -> float:
+    """Return the sigma of a dot or corner in survey.yaml, px."""
+    return survey.sigma.corner_px if survey.boards else survey.sigma.dot_px
 
 
 def _sigmas(survey: Survey, fit: FittedRig) -> list[Reason]:
@@ -366,7 +379,12 @@ def _inexact(survey: Survey, fit: BenchCalibration) -> Iterator[Reason]:
 
 
 def _pointing(survey: Survey, fit: Calibration | BenchCalibration) -> Iterator[Reason]:
-    """How much the calibration adds to a pointing from a click, camera pair by pair."""
+    """How much the calibration adds to a pointing from a click, camera pair by pair.
+
+    Of a survey that leaves something open that is no number: its covariance is of a chance.
+    """
+    if fit.degenerate:
+        return
     joint_rad = fit.joint_rad if isinstance(fit, BenchCalibration) else survey.sigma.joint_rad
     for cameras in head_cameras(fit.rig):
         by = cameras[0].rpartition("_")[0] if len(cameras) > 1 else cameras[0]
@@ -385,31 +403,23 @@ def _pointing(survey: Survey, fit: Calibration | BenchCalibration) -> Iterator[R
 
 
 def _exchanged_boards(survey: Survey, calibration: Calibration) -> Iterator[str]:
-    """A sentence for each two placements that were exchanged, and for each image of a wrong placement.
+    """A sentence for each placement whose images show another one.
 
     Of check images and images that the fit left out, every board of their set-up is tried where the fit has
     it.
     """
     left_out = {outlier.name for outlier in calibration.outliers if outlier.kind == "image"}
-    shown: dict[tuple[tuple[str, str], tuple[str, str]], list[str]] = {}
+    shown: dict[tuple[str, str, str], list[str]] = {}
     for image in calibration.images:
         if image.purpose == "check" or f"image {image.name}" in left_out:
             other = _shown_board(survey, calibration, image)
             if other is not None:
-                shown.setdefault(((image.setup, image.placement), other), []).append(image.name)
-    for (own, other), images in shown.items():
-        back = shown.get((other, own))
-        if back is None:
-            yield (
-                f"{_images(images)} cannot show placement {own[1]} but would show {other[1]} "
-                f"(set-up {own[0]}): correct the placement in images.csv"
-            )
-        elif own < other:
-            yield (
-                f"the boards of placements {own[1]} and {other[1]} (set-up {own[0]}) seem to be exchanged: "
-                f"{_images([*images, *back])} show the other one. Correct the names of the tapes in "
-                "station.csv or the placements in images.csv"
-            )
+                shown.setdefault((image.setup, image.placement, other[1]), []).append(image.name)
+    for (setup, own, other_one), images in shown.items():
+        yield (
+            f"image{'s' * (len(images) > 1)} {_some(images)} cannot show placement {own} but would show "
+            f"{other_one} (set-up {setup}): are they exchanged in images.csv, or their tapes in station.csv?"
+        )
 
 
 def _shown_board(survey: Survey, calibration: Calibration, image: ImageResiduals) -> tuple[str, str] | None:
@@ -472,7 +482,3 @@ def _at_the_end(fit: Calibration) -> list[Reason]:
 def _some(names: Sequence[str], most: int = 4) -> str:
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
-
-
-def _images(names: Sequence[str]) -> str:
-    return f"image{'s' * (len(names) > 1)} {_some(names)}"

@@ -104,8 +104,8 @@ def _refine(args: argparse.Namespace) -> Answer:
     """Propose a correction by hand-offs as a new mast file; 1, and no file, if they show none."""
     from calib.errors import NoCorrection
     from calib.files.mast_file import load_rig
-    from mastctl.calibration.mast_file import save_new
     from mastctl.calibration.refined import refine
+    from mastctl.calibration.run import save_new
     from mastctl.watch.handoffs import read_log
 
     for name in ("model", "report", "in_use", "method", "mast"):
@@ -226,7 +226,7 @@ def _document(done: Calibrated, in_use: StoredRig | None) -> dict[str, Any]:
     from calib.adjust.result import HELD_FIXED
     from mastctl.as_json import as_json
     from mastctl.calibration.landing import pointing_change
-    from mastctl.calibration.mast_file import findings_as_json, fit_document, picked
+    from mastctl.calibration.run import findings_as_json, fit_document, picked
 
     fit = done.calibration
     document = fit_document(done.survey, fit, done.verdict, done.saved)
@@ -253,8 +253,7 @@ def _document(done: Calibrated, in_use: StoredRig | None) -> dict[str, Any]:
 
 def _shown(done: Calibrated, in_use: StoredRig | None) -> Iterator[Shown]:
     from mastctl.calibration.landing import pointing_change
-    from mastctl.calibration.report import camera_table, mast_table
-    from mastctl.calibration.sigmas import finding_table, sigma_table
+    from mastctl.calibration.report import camera_table, finding_table, mast_table, sigma_table
 
     fit = done.calibration
     yield Shown(

@@ -19,7 +19,7 @@ from calib.geometry.rigid import FloatArray, Rigid, rot_x, rot_y, rot_z
 from drivers.sim.axis import AxisSettings
 from drivers.sim.heads import DEFAULT_HEADS, PRESETS
 from drivers.sim.settings import simulation_settings
-from mastctl.calibration.mast_file import rounded_matrix
+from mastctl.calibration.run import rounded_matrix
 from mastctl.config import CONFIG_SCHEMA, check_cameras, load_config
 from mastctl.errors import MastctlError
 from mastctl.packaged import driver_of_hardware, name_schema
