@@ -419,7 +419,7 @@ class CommandEntry:
             answer = act()
             operation = _operation_of(answer)
             if operation is not None and self._stopped_since(command, sent):
-                self._operations.end_stopped(operation)
+                self._operations.end(operation)
             allowed_s = usual_s if sent.deadline_s is None else sent.deadline_s
             if operation is not None and allowed_s is not None:
                 left_s = sent.came_s + allowed_s - self._clock.now_s()

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from drivers.clock import Clock
-from mastctl.answers import EstopCause, FaultAnswer, ServiceState, StateAnswer, StateFacts
+from mastctl.answers import FaultAnswer, LastResidual, ServiceState, StateAnswer, StateFacts
 from mastctl.as_json import as_json
 from mastctl.control.publisher import Publisher
 from mastctl.errors import MastctlError, NotNow, Unable
@@ -42,25 +42,19 @@ class StandingFault:
             "for_s": max(0.0, now_s - self.since_s),
         }
 
-    def same(self, other: StandingFault) -> bool:
-        """Return whether both are one fault at two moments: its message or its time may have gone on."""
-        return (self.device, self.code) == (other.device, other.code) and (
-            self.since_s == other.since_s or self.message == other.message
-        )
+    @property
+    def sentence(self) -> str:
+        """What is wrong, and until when."""
+        return f"{self.message}, until {self.until}"
 
 
 def same_faults(some: tuple[StandingFault, ...], others: tuple[StandingFault, ...]) -> bool:
-    """Return whether two lists are of the same faults."""
-    return len(some) == len(others) and all(one.same(other) for one, other in zip(some, others, strict=True))
-
-
-@dataclass(frozen=True)
-class Residual:
-    """The last measured residual, pixels (x, y), with one sigma, and the operation that measured it."""
-
-    residual_px: tuple[float, float]
-    residual_sigma_px: tuple[float, float]
-    operation: str
+    """Return whether two lists are of the same faults: their messages or their times may have gone on."""
+    return len(some) == len(others) and all(
+        (one.device, one.code) == (other.device, other.code)
+        and (one.since_s == other.since_s or one.message == other.message)
+        for one, other in zip(some, others, strict=True)
+    )
 
 
 @dataclass(frozen=True)
@@ -74,10 +68,6 @@ class Latched:
     reason: str
     at: str
 
-    def as_json(self) -> EstopCause:
-        """Return it as JSON."""
-        return {"name": self.name, "reason": self.reason, "at": self.at}
-
 
 def latched_sentence(entries: Sequence[Latched]) -> str:
     """Return the sentence of a latch with all its causes."""
@@ -86,6 +76,7 @@ def latched_sentence(entries: Sequence[Latched]) -> str:
 
 
 CLOSING = "the service is closing"
+AFTER_A_STOP = "a stop dropped the goal; the next command starts"
 
 MEANINGS: Mapping[ServiceState, str] = {
     "closing": "the daemon ends; it has sent a stop to the head",
@@ -100,25 +91,32 @@ MEANINGS: Mapping[ServiceState, str] = {
 }
 """The states: the daemon's is the first one in this order that is true."""
 
+Need = Literal["motion", "track", "rest", "idle", "latch"]
+"""What a command may need of the present state.
+
+``motion``: no operation runs, no stop is under way, nothing is latched, the service is not closing.
+``track``: that, and no track is active. ``rest``: no operation runs and the head does not move. ``idle``: no
+operation runs, and no stop is under way; the head may move, or be latched. ``latch``: an emergency stop is
+latched, and its stop is over.
+"""
+
 
 @dataclass(frozen=True)
 class Standing:
     """What the daemon is doing at one moment; replaced at each change, never edited.
 
-    ``since_s``: of the state, seconds of CLOCK_MONOTONIC; ``sequence`` grows by one with each change.
-    ``target``: the request that runs, or ran last. ``head_moves``: of the last reading, None before the
-    first; ``coasts``: it moved when a stop was requested, and was not read at rest since. ``stops``: under
-    way, not confirmed by the head; ``stopping``: one is, or the operation that it stopped has not ended.
-    ``dropped``: what ended the last motion before its goal (a stop, a reset, a fault); empty if nothing did,
-    or an operation or a track has begun since. ``faults`` are the head's; ``latched`` are the causes of an
-    emergency stop, the oldest first.
+    ``since_s``: of the state, seconds of CLOCK_MONOTONIC. ``target``: the request that runs, or ran last.
+    ``head_moves``: of the last reading, None before the first; ``coasts``: it moved when a stop was
+    requested, and was not read at rest since. ``stops``: under way, not confirmed by the head; ``stopping``:
+    one is, or the operation that it stopped has not ended. ``dropped``: what ended the last motion before its
+    goal (a stop, a reset, a fault); empty if nothing did, or an operation or a track has begun since.
+    ``faults`` are the head's; ``latched`` are the causes of an emergency stop, the oldest first.
     """
 
     since_s: float = 0.0
-    sequence: int = 0
     operation: str | None = None
     target: Mapping[str, Any] | None = None
-    residual: Residual | None = None
+    residual: LastResidual | None = None
     track: str | None = None
     head_moves: bool | None = None
     coasts: bool = False
@@ -132,44 +130,59 @@ class Standing:
     @property
     def state(self) -> ServiceState:
         """The first of `MEANINGS` that is true."""
-        true: Mapping[ServiceState, object] = {
-            "closing": self.closing,
-            "stopping": self.stopping,
-            "stopped": self.latched,
-            "fault": self.faults,
-            "tracking": self.track is not None,
-            "moving": self.operation is not None or (self.head_moves and not self.coasts),
-            "holding": self.dropped,
-            "starting": self.head_moves is None,
-            "ready": True,
-        }
-        return next(state for state in MEANINGS if true[state])
+        return self._judged()[0]
 
     @property
     def reason(self) -> str:
         """One sentence that says why the state is what it is; empty where nothing needs to be said."""
-        match self.state:
-            case "closing":
-                return CLOSING
-            case "stopping" if self.stops == 0:
-                return f"operation {self.operation} is being stopped"
-            case "stopping":
-                return "the mast is being stopped"
-            case "stopped":
-                return "; ".join([latched_sentence(self.latched), *map(_sentence, self.faults[:1])])
-            case "fault":
-                more = len(self.faults) - 1
-                return _sentence(self.faults[0]) + (f" (and {more} more)" if more else "")
-            case "tracking":
-                return f"track {self.track} is followed"
-            case "moving":
-                return "the head moves" if self.operation is None else f"operation {self.operation} runs"
-            case "holding":
-                return self.dropped
-            case "starting":
-                return MEANINGS["starting"]
-            case _:
-                return ""
+        return self._judged()[1]
+
+    def _judged(self) -> tuple[ServiceState, str]:
+        if self.closing:
+            return "closing", CLOSING
+        if self.stopping:
+            what = "the mast" if self.stops else f"operation {self.operation}"
+            return "stopping", f"{what} is being stopped"
+        if self.latched:
+            sentences = [latched_sentence(self.latched), *(one.sentence for one in self.faults[:1])]
+            return "stopped", "; ".join(sentences)
+        if self.faults:
+            more = len(self.faults) - 1
+            return "fault", self.faults[0].sentence + (f" (and {more} more)" if more else "")
+        if self.track is not None:
+            return "tracking", f"track {self.track} is followed"
+        if self.operation is not None:
+            return "moving", f"operation {self.operation} runs"
+        if self.head_moves and not self.coasts:
+            return "moving", "the head moves"
+        if self.dropped:
+            return "holding", self.dropped
+        if self.head_moves is None:
+            return "starting", MEANINGS["starting"]
+        return "ready", ""
+
+    def refusal(self, need: Need) -> MastctlError | None:
+        """Return the refusal of a command that needs something, None if there is none.
+
+        It is NotNow ``busy``, ``stopping``, ``estopped``, ``moving`` or ``not_estopped``, Unable ``closing``.
+        A fault refuses nothing: a later move may clear it, and the head itself refuses what it cannot do.
+        """
+        if self.closing:
+            return Unable("closing", CLOSING)
+        if self.stopping:
+            return NotNow("stopping", f"{self.reason}; try again when that is over")
+        if need == "latch":
+            message = "no emergency stop is latched; there is nothing to reset"
+            return None if self.latched else NotNow("not_estopped", message)
+        if self.latched and need not in ("rest", "idle"):
+            return NotNow("estopped", latched_sentence(self.latched))
+        if self.operation is not None:
+            return busy(self.operation)
+        if need == "rest" and self.head_moves:
+            return NotNow("moving", "the head moves; try again when it rests")
+        if need == "track" and self.track is not None:
+            return NotNow("busy", f"track {self.track} runs; stop it before another is started")
+        return None
 
     def as_json(self, now_s: float) -> StateAnswer:
         """Return it as JSON at a moment, as events have it."""
@@ -177,62 +190,22 @@ class Standing:
 
     def summary(self, now_s: float) -> StateFacts:
         """Return it as JSON at a moment, without the track and whether the head moves."""
+        state, reason = self._judged()
         return {
-            "state": self.state,
-            "reason": self.reason,
+            "state": state,
+            "reason": reason,
             "state_for_s": max(0.0, now_s - self.since_s),
             "estop": as_json(self.latched[0]) if self.latched else None,
             "estops": as_json(self.latched),
             "operation": self.operation,
             "target": as_json(self.target),
-            "last_residual": as_json(self.residual),
+            "last_residual": self.residual,
         }
-
-
-def _sentence(fault: StandingFault) -> str:
-    return f"{fault.message}, until {fault.until}"
-
-
-Need = Literal["motion", "track", "rest", "idle", "latch"]
-
-
-def refusal_of(now: Standing, need: Need) -> MastctlError | None:
-    """Return the refusal of a command that needs something of the present state, None if there is none.
-
-    ``motion``: no operation runs, no stop is under way, nothing is latched, the service is not closing.
-    ``track``: that, and no track is active. ``rest``: no operation runs and the head does not move. ``idle``:
-    no operation runs, and no stop is under way; the head may move, or be latched. ``latch``: an emergency
-    stop is latched, and its stop is over.
-
-    It is NotNow ``busy``, ``stopping``, ``estopped``, ``moving`` or ``not_estopped``, Unable ``closing``. A
-    fault refuses nothing: a later move may clear it, and the head itself refuses what it cannot do.
-    """
-    if now.closing:
-        return Unable("closing", CLOSING)
-    if now.stopping:
-        return NotNow("stopping", f"{now.reason}; try again when that is over")
-    if need == "latch":
-        message = "no emergency stop is latched; there is nothing to reset"
-        return None if now.latched else NotNow("not_estopped", message)
-    if now.latched and need not in ("rest", "idle"):
-        return NotNow("estopped", latched_sentence(now.latched))
-    if now.operation is not None:
-        return busy(now.operation)
-    if need == "rest" and now.head_moves:
-        return NotNow("moving", "the head moves; try again when it rests")
-    if need == "track" and now.track is not None:
-        return NotNow("busy", f"track {now.track} runs; stop it before another is started")
-    return None
 
 
 def busy(operation: str) -> NotNow:
     """Return the refusal of what cannot be done beside a running operation."""
     return NotNow("busy", f"operation {operation} is running; wait for it or stop it")
-
-
-AFTER_A_STOP = "a stop dropped the goal; the next command starts"
-
-_Change = Callable[[Standing], Standing]
 
 
 class StateMachine:
@@ -243,14 +216,11 @@ class StateMachine:
     """
 
     def __init__(
-        self,
-        clock: Clock,
-        publisher: Publisher | None = None,
-        latched: Sequence[Latched] = (),
+        self, clock: Clock, publisher: Publisher | None = None, latched: Sequence[Latched] = ()
     ) -> None:
         self.publisher = publisher or Publisher()
         self._clock = clock
-        self._lock = threading.RLock()
+        self._lock = threading.Lock()
         self._standing = Standing(since_s=clock.now_s(), latched=tuple(latched))
         self.publisher.publish("state", "machine", self._standing)
 
@@ -264,39 +234,26 @@ class StateMachine:
         now = self.standing
         return now.operation is not None or now.track is not None
 
-    def refusal(self, need: Need) -> MastctlError | None:
-        """Return the refusal of a command that needs something, as `refusal_of`, of this moment."""
-        return refusal_of(self.standing, need)
-
     def operation_began(self, operation: str, target: Mapping[str, Any]) -> None:
-        """Let an operation begin. Raises what `refusal` returns for ``motion``; then nothing has changed."""
-        facts: dict[str, Any] = {"operation": operation, "target": dict(target), "dropped": ""}
-        with self._lock:
-            refused = refusal_of(self._standing, "motion")
-            if refused is not None:
+        """Let an operation begin. Raises the refusal of ``motion``; then nothing has changed."""
+
+        def begin(now: Standing) -> Standing:
+            if (refused := now.refusal("motion")) is not None:
                 raise refused
-            self._change(lambda now: replace(now, **facts))
+            return replace(now, operation=operation, target=dict(target), dropped="")
 
-    def operation_ended(self, operation: str, residual: Residual | None = None) -> None:
-        """Note that an operation ended, and what it measured last; not twice of one."""
-        self._change(
-            lambda now: (
-                replace(now, operation=None, residual=residual or now.residual)
-                if now.operation == operation
-                else now
-            )
-        )
+        self._change(begin)
 
-    def track_began(self, track: str) -> None:
-        """Note that a track began, of which the operation of this id looks first.
+    def operation_ended(self, residual: LastResidual | None = None) -> None:
+        """Note that the operation ended, and what it measured last."""
+        self._change(lambda now: replace(now, operation=None, residual=residual or now.residual))
+
+    def follow(self, track: str | None) -> None:
+        """Note which track is active, by the id of the operation that began it.
 
         Nothing is refused: its operation was begun, and a stop in between ends the track too.
         """
-        self._change(lambda now: replace(now, track=track, dropped=""))
-
-    def track_ended(self, track: str) -> None:
-        """Note that a track ended."""
-        self._change(lambda now: replace(now, track=None) if now.track == track else now)
+        self._change(lambda now: replace(now, track=track, dropped="" if track else now.dropped))
 
     def head_read(self, moving: bool) -> None:
         """Note what a reading of the head says; nothing is done if the one before said the same."""
@@ -304,18 +261,15 @@ class StateMachine:
             self._change(lambda now: replace(now, head_moves=moving, coasts=now.coasts and moving))
 
     def head_faults(self, faults: tuple[StandingFault, ...]) -> None:
-        """Note all that is wrong with the head now; nothing is done if it is the same as before."""
+        """Note all that is wrong with the head now."""
 
         def change(now: Standing) -> Standing:
-            if same_faults(now.faults, faults):
-                return now
             dropped = now.dropped
-            if not faults and now.operation is None and now.track is None:
+            if now.faults and not faults and now.operation is None and now.track is None:
                 dropped = dropped or f"it is over: {now.faults[0].message}; the next command starts"
             return replace(now, faults=faults, dropped=dropped)
 
-        if not same_faults(self._standing.faults, faults):
-            self._change(change)
+        self._change(change)
 
     def stop_requested(self) -> None:
         """Note that a stop was requested; `stop_ended` follows when it is over."""
@@ -341,20 +295,15 @@ class StateMachine:
         self._change(lambda now: replace(now, latched=tuple(latched()), dropped=AFTER_A_STOP))
 
     def reset(self, name: str, reason: str, latched: Callable[[], Sequence[Latched]] = tuple) -> None:
-        """Note that a latch was released, of a service that called `refusal` of ``latch`` before.
-
-        ``latched`` returns the causes that came since. It must not wait.
-        """
+        """Note that a latch was released; ``latched`` returns the causes that came since, without waiting."""
         dropped = f"reset by {name}: {reason}; the next command starts"
-        self._change(
-            lambda now: replace(now, latched=tuple(latched()), dropped=dropped) if now.latched else now
-        )
+        self._change(lambda now: replace(now, latched=tuple(latched()), dropped=dropped))
 
     def closing(self) -> None:
         """Note that the service is closing: nothing begins any more."""
         self._change(lambda now: replace(now, closing=True))
 
-    def _change(self, change: _Change) -> None:
+    def _change(self, change: Callable[[Standing], Standing]) -> None:
         """Take other facts; publish a change."""
         with self._lock:
             before = self._standing
@@ -364,5 +313,5 @@ class StateMachine:
             if now == before:
                 return
             since_s = before.since_s if now.state == before.state else self._clock.now_s()
-            self._standing = replace(now, since_s=since_s, sequence=before.sequence + 1)
+            self._standing = replace(now, since_s=since_s)
             self.publisher.publish("state", "machine", self._standing)

@@ -15,15 +15,15 @@ import secrets
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
 from calib.errors import CalibError
 from drivers.clock import Clock, deadlines_on
 from drivers.errors import DriverError
-from mastctl.answers import OperationAnswer, OperationListed, OperationState
+from mastctl.answers import LastResidual, OperationAnswer, OperationListed, OperationState
 from mastctl.as_json import as_json
-from mastctl.control.machine import CLOSING, Need, Residual, StateMachine
+from mastctl.control.machine import CLOSING, Need, StateMachine
 from mastctl.errors import MastctlError, NotKnown, NotNow, Stopped, Unable, error_body
 
 log = logging.getLogger(__name__)
@@ -80,13 +80,13 @@ class Operation:
         return {**self.listed(), "steps": as_json(self.steps)}
 
 
-def last_residual(result: Any, name: str) -> Residual | None:
+def last_residual(result: Any, name: str) -> LastResidual | None:
     """Return the residual that a result ends with, if it measured one."""
     last = as_json(_last_pointing(result))
     residual, sigma = last.get("residual_px"), last.get("residual_sigma_px")
     if not (residual and sigma and None not in residual and None not in sigma):
         return None
-    return Residual((residual[0], residual[1]), (sigma[0], sigma[1]), name)
+    return {"residual_px": residual, "residual_sigma_px": sigma, "operation": name}
 
 
 def last_frame(result: Any) -> str | None:
@@ -112,6 +112,23 @@ Work = Callable[[Callable[[Any], None], threading.Event], Any]
 OnEnd = Callable[[Operation], None]
 
 
+@dataclass(eq=False)
+class _Running:
+    """The operation that runs; ``ended_by`` is what its record says once it is ``cancelled``.
+
+    ``late`` is the moment at which it is cancelled, and by what.
+    """
+
+    id: str
+    cancelled: threading.Event = field(default_factory=threading.Event)
+    ended_by: MastctlError = field(default_factory=lambda: Stopped(STOP_REQUESTED))
+    late: tuple[float, MastctlError] | None = None
+
+    def end_by(self, error: MastctlError) -> None:
+        self.ended_by = error
+        self.cancelled.set()
+
+
 class OperationRunner:
     """The operations of this run of the service; safe to use from any thread.
 
@@ -133,18 +150,14 @@ class OperationRunner:
         self._publisher = self._machine.publisher
         self._clock = clock
         self._time = deadlines_on(clock)
-        self._ended = self._time.signal()
-        self._lock = threading.Lock()
+        self._changed = self._time.signal()
         self._records: Mapping[str, Operation] = {}  # oldest first
         self._numbers = itertools.count(1)
         self._run = run or secrets.token_hex(2)
         self._on_ended = on_ended
-        self._current: tuple[str, threading.Event, threading.Thread] | None = None
+        self._current: _Running | None = None
         self._closed = False
-        self._stops_of_its_own = 0  # under way, for operations beyond their deadline
-        self._deadline: tuple[str, float, MastctlError] | None = None  # of an operation; what ends it then
         self._time.thread(self._watch, "deadlines").start()
-        self._cancelled_because: MastctlError = Stopped(STOP_REQUESTED)
 
     @property
     def running(self) -> str | None:
@@ -155,24 +168,20 @@ class OperationRunner:
         """Start ``work(record_step, cancelled)`` in a thread and return its first record.
 
         ``on_end`` gets the last record, in the same thread, when the next operation may be started already.
-        Waits for nothing: `let_stopped_end` does, before any lock is taken. Raises as `StateMachine.refusal`
+        Waits for nothing: `let_stopped_end` does, before any lock is taken. Raises as `Standing.refusal`
         of ``motion``; Unable ``no_thread`` if the machine has none for it (the record says so too).
         """
-        with self._lock:
+        with self._changed:
             name = f"{next(self._numbers):06d}-{self._run}"
             self._machine.operation_began(name, request)
             operation = Operation(name, "queued", dict(request), self._clock.now_s())
-            cancelled = threading.Event()
-            thread = self._clock.thread(
-                lambda: self._work(name, work, cancelled, on_end), f"operation {name}"
-            )
             self._keep(operation)
-            self._current = (name, cancelled, thread)
+            current = self._current = _Running(name)
         try:
-            thread.start()
+            self._clock.thread(lambda: self._work(current, work, on_end), f"operation {name}").start()
         except RuntimeError as error:  # no thread to be had: nothing has moved, and the next may have one
             unable = Unable("no_thread", f"operation {name} was not started: {error}")
-            self._end(name, "failed", None, error_body(unable))
+            self._end(current, "failed", None, error_body(unable))
             raise unable from None
         return operation
 
@@ -186,7 +195,7 @@ class OperationRunner:
             yield
         finally:
             self._mover.allow_moves(holder)
-            self._machine.stop_ended()
+            self._stop_ended()
 
     def stop(self, reason: str = STOP_REQUESTED, also: Callable[[], object] = lambda: None) -> str | None:
         """Stop the mast, then the running operation, if any, and what ``also`` ends; return its id.
@@ -196,84 +205,66 @@ class OperationRunner:
         all the same.
         """
         with self.stopping():
-            running = self._current
+            running, stopped = self._current, Stopped(reason)
             if running is not None:  # what ends from here on, ends by the stop
-                self._cancelled_because = Stopped(reason)
-                running[1].set()
+                running.end_by(stopped)
             try:
                 self._mover.stop()
             finally:
-                with self._lock:
-                    name = self._cancel(reason)
+                with self._changed:
+                    name = self._cancel(stopped)
                 also()
-        if name is None and running is not None and self.get(running[0]).state == "stopped":
-            name = running[0]
+        if name is None and running is not None and self.get(running.id).state == "stopped":
+            name = running.id
         log.info("stop%s", f": operation {name}" if name else "")
         return name
 
-    def refusal(self, need: Need) -> MastctlError | None:
-        """Return the refusal of a command, as `StateMachine.refusal`; what was stopped may end first."""
-        self.let_stopped_end()
-        return self._machine.refusal(need)
+    def stop_one(self, name: str, error: MastctlError | None = None) -> None:
+        """Stop the mast and end one operation, unless it has ended or is being ended already.
 
-    def let_stopped_end(self) -> None:
-        """Wait for an operation that is being ended, and for a deadline's stop; `ENDS_SOON_S` at most.
-
-        Returns at once if there is none. A stop itself is answered when the head has confirmed it.
+        ``error`` goes into its record. Raises as `get`; DriverError if the head did not confirm the stop.
         """
-        until_s = self._time.now_s() + ENDS_SOON_S
-        with self._ended:
-            while self._being_ended():
-                left_s = until_s - self._time.now_s()
-                if left_s <= 0:
-                    return
-                self._ended.wait(left_s)
+        self.get(name)
+        with self._changed:
+            current = self._current
+            if current is None or current.id != name or current.cancelled.is_set():
+                return
+            self._machine.stop_requested()
+            self._cancel(error or Stopped(STOP_REQUESTED))
+        try:
+            self._mover.stop()
+        finally:
+            self._stop_ended()
 
-    def _being_ended(self) -> bool:
-        current = self._current
-        return self._stops_of_its_own > 0 or (current is not None and current[1].is_set())
+    def end(self, name: str, error: MastctlError | None = None) -> None:
+        """Do the same; what the head does not confirm is logged, and a fault of it."""
+        with self._logged(f"when operation {name} was to end"):
+            self.stop_one(name, error)
 
     def end_within(self, name: str, left_s: float, allowed_s: float) -> None:
         """Stop the mast and end an operation with ``deadline_passed`` if it runs longer than ``left_s``.
 
-        ``allowed_s`` is how long altogether, for the message. A stop that comes before is the last word.
+        ``allowed_s`` is how long altogether, for the message. A stop that comes before is the last word; the
+        first of several deadlines counts.
         """
         late = NotNow("deadline_passed", f"operation {name} did not end in the {allowed_s:g} s it was given")
-        with self._ended:
-            if (current := self._current) is not None and current[0] == name:
-                self._deadline = name, self._time.now_s() + left_s, late
-                self._ended.notify_all()
+        with self._changed:
+            current = self._current
+            if current is not None and current.id == name and current.late is None:
+                current.late = self._time.now_s() + left_s, late
+                self._changed.notify_all()
 
-    def _watch(self) -> None:
-        """End each operation at its deadline, in a thread of its own."""
-        while True:
-            with self._ended:
-                if self._closed:
-                    return
-                if self._deadline is None:
-                    self._ended.wait(idle=True)
-                    continue
-                name, until_s, late = self._deadline
-                wait_s = until_s - self._time.now_s()
-                if wait_s > 0.0:
-                    self._ended.wait(wait_s, idle=True)
-                    continue
-                self._deadline = None
-            self._end_by(name, late)
+    def refusal(self, need: Need) -> MastctlError | None:
+        """Return the refusal of a command, as `Standing.refusal`; what was stopped may end first."""
+        self.let_stopped_end()
+        return self._machine.standing.refusal(need)
 
-    def end_stopped(self, name: str, reason: str = STOP_REQUESTED) -> None:
-        """Stop the mast and end an operation if it runs: it began after a stop, or is of no use any more."""
-        self._end_by(name, Stopped(reason))
-
-    def stop_one(self, name: str) -> None:
-        """Stop the mast and one operation, if it runs; nothing where it has ended, or another one runs.
-
-        Raises as `get`; DriverError if the head did not confirm the stop.
-        """
-        self.get(name)
-        error = self._end_by(name, Stopped(STOP_REQUESTED))
-        if error is not None:
-            raise error
+    def let_stopped_end(self) -> None:
+        """Wait for a stop, and for the operation that it ends; `ENDS_SOON_S` at most."""
+        until_s = self._time.now_s() + ENDS_SOON_S
+        with self._changed:
+            while self._machine.standing.stopping and (left_s := until_s - self._time.now_s()) > 0:
+                self._changed.wait(left_s)
 
     def get(self, name: str) -> Operation:
         """Return one record. Raises NotKnown ``operation_unknown`` if it is not of this run, or not kept."""
@@ -294,138 +285,130 @@ class OperationRunner:
         """
         if self._closed:
             return
-        with self._ended:
-            self._closed = True
-            self._ended.notify_all()
         self._machine.closing()
         self._mover.block_moves(self, CLOSING)
-        self._stop_anyway("as the service closes")
-        with self._lock:
-            current = self._current
-            self._cancel(CLOSING)
-        if current is None:
-            return
-        current[2].join(END_TIMEOUT_S)
-        if current[2].is_alive():
-            log.error("operation %s did not end within %.0f s; it is given up", current[0], END_TIMEOUT_S)
-            self._end(current[0], "stopped", None, error_body(Stopped(CLOSING)))
-
-    def _end_by(self, name: str, error: MastctlError) -> BaseException | None:
-        """End an operation with an error and stop the mast, unless it is being stopped already.
-
-        Returns why the head did not confirm the stop, None if it did.
-        """
-        with self._lock:
-            current = self._current
-            if current is None or current[0] != name or current[1].is_set():
-                return None
-            with self._ended:
-                self._stops_of_its_own += 1
-            self._cancelled_because = error
-            current[1].set()
-            self._mover.block_moves(name, str(error))
-        self._machine.stop_requested()
-        unconfirmed = self._stop_anyway(f"when operation {name} was to end")
-        self._machine.stop_ended()
-        with self._ended:
-            self._stops_of_its_own -= 1
-            self._ended.notify_all()
-        return unconfirmed
-
-    def _stop_anyway(self, when: str) -> BaseException | None:
-        """Stop the mast where no client waits for the answer; return what its driver raises."""
-        try:
+        with self._logged("as the service closes"):
             self._mover.stop()
+        closing, until_s = Stopped(CLOSING), self._time.now_s() + END_TIMEOUT_S
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+            self._cancel(closing)
+            while (current := self._current) is not None and (left_s := until_s - self._time.now_s()) > 0:
+                self._changed.wait(left_s)
+        if current is not None:
+            log.error("operation %s did not end within %.0f s; it is given up", current.id, END_TIMEOUT_S)
+            self._end(current, "stopped", None, error_body(closing))
+
+    def _watch(self) -> None:
+        """End each operation at its deadline, in a thread of its own."""
+        while True:
+            with self._changed:
+                if self._closed:
+                    return
+                current = self._current
+                late = None if current is None else current.late
+                if current is None or late is None or current.cancelled.is_set():
+                    self._changed.wait(idle=True)
+                    continue
+                if (left_s := late[0] - self._time.now_s()) > 0.0:
+                    self._changed.wait(left_s, idle=True)
+                    continue
+            self.end(current.id, late[1])
+
+    def _stop_ended(self) -> None:
+        self._machine.stop_ended()
+        with self._changed:
+            self._changed.notify_all()
+
+    @contextmanager
+    def _logged(self, when: str) -> Iterator[None]:
+        """Log why the head did not confirm a stop."""
+        try:
+            yield
         except BaseException as error:
             log.error("the head did not confirm the stop %s: %s", when, error_body(error)["message"])
-            return error
-        return None
 
     def _keep(self, operation: Operation) -> None:
         """Keep a record, and forget the oldest; the lock is kept."""
         records = {**self._records, operation.id: operation}
-        while len(records) > KEPT_OPERATIONS:
+        if len(records) > KEPT_OPERATIONS:
             oldest = next(iter(records))
             del records[oldest]
             self._publisher.forget("operation", oldest)
         self._records = records
         self._publisher.publish("operation", operation.id, operation)
 
-    def _cancel(self, reason: str) -> str | None:
+    def _cancel(self, error: MastctlError) -> str | None:
         """Have the running operation end and let no further move of it out; the lock is kept."""
         if self._current is None:
             return None
-        name, cancelled, _ = self._current
-        self._cancelled_because = Stopped(reason)
-        cancelled.set()
-        self._mover.block_moves(name, reason)
-        return name
+        self._current.end_by(error)
+        self._mover.block_moves(self._current.id, str(error))
+        return self._current.id
 
-    def _work(self, name: str, work: Work, cancelled: threading.Event, on_end: OnEnd | None) -> None:
+    def _work(self, current: _Running, work: Work, on_end: OnEnd | None) -> None:
         """Run one operation, then hand over its last record."""
-        self._run_to_end(name, work, cancelled)
+        self._run_to_end(current, work)
         for hand_over in (self._on_ended, on_end):
             if hand_over is None:
                 continue
             try:
-                hand_over(self.get(name))
+                hand_over(self.get(current.id))
             except Exception:  # its record is closed
-                log.exception("a step after operation %s met a defect of the program", name)
+                log.exception("a step after operation %s met a defect of the program", current.id)
 
-    def _run_to_end(self, name: str, work: Work, cancelled: threading.Event) -> None:
+    def _run_to_end(self, current: _Running, work: Work) -> None:
         """Run one operation to its end; whatever happens is in its record afterwards."""
+        name = current.id
 
         def record(step: Any) -> None:
-            with self._lock:
+            with self._changed:
                 known = self._records.get(name)
                 if known is not None:
                     self._keep(replace(known, steps=(*known.steps, step)))
 
-        with self._lock:
+        with self._changed:
             self._keep(replace(self._records[name], state="running", started_s=self._clock.now_s()))
-        result: Any = None
-        error: BaseException | None = None
         try:
-            result = work(record, cancelled)
+            result = work(record, current.cancelled)
+            self._end(current, "done", result, None, last_residual(result, name))
+            log.info("operation %s done", name)
+            return
         except (MastctlError, DriverError, CalibError) as refusal:
-            error = refusal
+            error: BaseException = refusal
         except BaseException as defect:  # the one broad catch: nothing may leave the mast moving
             log.exception("operation %s met a defect of the program", name)
             error = defect
-        if error is None:
-            self._end(name, "done", result, None)
-            log.info("operation %s done", name)
-            return
-        self._stop_anyway(f"after operation {name}")
+        with self._logged(f"after operation {name}"):
+            self._mover.stop()
         partial = getattr(error, "result", None)
-        if cancelled.is_set():
-            error = self._cancelled_because
+        if current.cancelled.is_set():
+            error = current.ended_by
         body = error_body(error)
-        if isinstance(error, Stopped) and cancelled.is_set():
-            self._end(name, "stopped", partial, body)
+        if isinstance(error, Stopped) and current.cancelled.is_set():
+            self._end(current, "stopped", partial, body)
             log.info("operation %s stopped", name)
         else:
-            self._end(name, "failed", partial, body)
+            self._end(current, "failed", partial, body)
             log.warning("operation %s failed: %s", name, body["message"])
 
-    def _end(self, name: str, state: OperationState, result: Any, error: dict[str, Any] | None) -> None:
+    def _end(
+        self,
+        current: _Running,
+        state: OperationState,
+        result: Any,
+        error: dict[str, Any] | None,
+        residual: LastResidual | None = None,
+    ) -> None:
         """Close a record and make room for the next operation."""
-        try:
-            residual = last_residual(result, name)
-        except Exception:  # a result that is none must not keep the next operation out
-            log.exception("the result of operation %s holds no residual", name)
-            residual, result = None, None
-        with self._lock:
-            if self._current is None or self._current[0] != name:
+        with self._changed:
+            if self._current is not current:
                 return  # given up before
-            self._mover.allow_moves(name)
-            self._machine.operation_ended(name, residual)
-            known = self._records.get(name)
-            if known is not None:  # last, since it is what clients wait for
-                ended_s = self._clock.now_s()
-                self._keep(replace(known, state=state, result=result, error=error, ended_s=ended_s))
+            self._mover.allow_moves(current.id)
+            self._machine.operation_ended(residual)
+            ended_s = self._clock.now_s()  # the record last, since it is what clients wait for
+            known = self._records[current.id]
+            self._keep(replace(known, state=state, result=result, error=error, ended_s=ended_s))
             self._current = None  # after the record, which a waiting client reads
-        with self._ended:
-            if self._deadline is not None and self._deadline[0] == name:
-                self._deadline = None
-            self._ended.notify_all()
+            self._changed.notify_all()

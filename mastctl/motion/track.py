@@ -474,11 +474,8 @@ class Tracker:
             log.warning("track %s: %s", status.id, status.reason)
         self._status = replace(status, sequence=before.sequence + 1, changed_s=self._clock.now_s())
         self._machine.publisher.publish("track", "track", self._status)
-        was, now = before.state in ACTIVE, status.state in ACTIVE
-        if now and not was and status.id is not None:
-            self._machine.track_began(status.id)
-        if was and not now and before.id is not None:
-            self._machine.track_ended(before.id)
+        if (before.state in ACTIVE) != (status.state in ACTIVE):
+            self._machine.follow(status.id if status.state in ACTIVE else None)
 
     # In the operation's thread
 

@@ -196,7 +196,7 @@ class Masts:
         self._operations.let_stopped_end()
         self._devices.read()  # the machine knows whether it moves now
         with self._lock:
-            refusal = self._machine.refusal("rest")
+            refusal = self._machine.standing.refusal("rest")
             if refusal is not None:
                 raise refusal
             self._follow(mast)

@@ -15,7 +15,7 @@ from mastctl.control.operations import Operation, OperationRunner
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import check_known
 from mastctl.devices.judge import Limits
-from mastctl.errors import NotNow
+from mastctl.errors import NotNow, Stopped
 from mastctl.motion.loop import PointingLoop
 from mastctl.motion.requests import (
     PixelTarget,
@@ -158,7 +158,7 @@ class Steering:
             begun = self._tracker.take_pose(pose, look, self._turn_sun)
         ended = self._tracker.status
         if running is not None and ended.state not in ACTIVE:
-            self._operations.end_stopped(running, ended.reason)
+            self._operations.end(running, Stopped(ended.reason))
         return begun
 
     def _turn_sun(self, pose: RoverPose) -> None:

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError
 from mastctl.answers import EstopAnswer, ResetAnswer, StopAnswer
+from mastctl.as_json import as_json
 from mastctl.control.machine import Latched, StandingFault, StateMachine, latched_sentence
 from mastctl.control.operations import STOP_REQUESTED, OperationRunner
 from mastctl.devices.devices import Devices
@@ -195,7 +196,7 @@ class Stopping:
             raise NotNow("stopping", "the mast is being stopped; an emergency stop is released after that")
         causes = self._latch.release(reason, name)
         self._machine.reset(name, reason, lambda: self._latch.entries)
-        return {"latched": bool(self._latch.entries), "released": causes[0].as_json()}
+        return {"latched": bool(self._latch.entries), "released": as_json(causes[0])}
 
     def _refusal(self) -> Estopped | None:
         """What refuses every move while anything is latched."""

@@ -71,7 +71,7 @@ class World:
     def end_within(self, name: str, left_s: float, allowed_s: float) -> None:
         self.deadlines.append((name, left_s, allowed_s))
 
-    def end_stopped(self, name: str) -> None:
+    def end(self, name: str) -> None:
         self.ended_by_stop.append(name)
 
     def refusal(self, need: str) -> NotNow | None:

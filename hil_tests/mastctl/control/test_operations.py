@@ -12,7 +12,7 @@ from drivers.clock import ManualClock
 from drivers.errors import NoReply
 from hil_tests.mastctl.service_fakes import fake_result
 from hil_tests.waiting import NET_S, joined, present, until
-from mastctl.control.machine import CLOSING, Residual, StateMachine
+from mastctl.control.machine import CLOSING, StateMachine
 from mastctl.control.operations import KEPT_OPERATIONS, STOP_REQUESTED, Operation, OperationRunner
 from mastctl.errors import NotKnown, NotNow, Stopped, Unable, error_body
 
@@ -202,7 +202,7 @@ def test_what_is_done_leaves_the_head_alone_and_its_last_residual_behind(
     assert (told["position_m"], told["range_m"]) == ([1.0, 2.0, 3.0], 3.7)
     assert (told["created_s"], told["started_s"], told["ended_s"]) == (50.0, 50.0, 50.0)
     assert mover.told == []
-    residual = Residual((0.25, -0.5), (0.1, 0.2), name)
+    residual = {"residual_px": [0.25, -0.5], "residual_sigma_px": [0.1, 0.2], "operation": name}
     assert machine.standing.residual == residual
     for later in (pointed(), pointed(None), pointed([None, 1.0]), None):
         again = operations.start({}, lambda record, cancelled, later=later: later).id  # type: ignore[misc]

@@ -229,7 +229,7 @@ def test_an_operation_that_slips_in_while_it_is_latched_fails_at_the_gate(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware), Client(daemon.url) as client:
-        monkeypatch.setattr(machine_module, "refusal_of", lambda now, need: None)
+        monkeypatch.setattr(machine_module.Standing, "refusal", lambda now, need: None)
         client.estop()
         record = client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))
         assert (record["state"], present(record["error"])["code"]) == ("failed", "estopped")
