@@ -105,7 +105,7 @@ def test_no_lock_that_somebody_holds_keeps_the_event_loop(
         client.snapshot("navcam_left")
         found = dict(locks_of(daemon.service, set()))
         found["FaultPanel._lock"] = hardware.simulation.faults._lock
-        for one in ("Masts._lock", "OperationRunner._lock", "Tracker._lock", "FrameStore._lock"):
+        for one in ("Masts._lock", "OperationRunner._changed", "Tracker._lock", "FrameStore._lock"):
             assert one in found
         for place, lock in found.items():
             with lock:
