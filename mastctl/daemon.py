@@ -17,8 +17,10 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import TracebackType
@@ -31,7 +33,7 @@ from drivers.faults import LOG
 from drivers.hardware import Hardware
 from mastctl import signals
 from mastctl.config import Config, Listen
-from mastctl.errors import MastctlError, Unable
+from mastctl.errors import MastctlError, Unable, one_line
 from mastctl.http.guard import EntryRules
 from mastctl.http.tokens import Access, TokenList
 from mastctl.http.waiting import SilentConnections, Streams, Waiting
@@ -39,7 +41,6 @@ from mastctl.logs import stall_while
 from mastctl.safety.state_folder import StateFolder
 from mastctl.service.service import Service
 from mastctl.service.stopping import StopsHang
-from mastctl.service_manager import Heartbeat, ServiceManager
 from mastctl.web.app import create_app
 from mastctl.web.commands import Parts
 from mastctl.web.pictures import CameraFeeds
@@ -58,6 +59,7 @@ REREAD_S = 0.5  # how late a new or a revoked token may be known
 SWITCH_S = 0.0005  # a stop goes through five threads and may wait so long for each; 5 ms by default
 START_TIMEOUT_S = 600.0  # the first start compiles the simulator's kernels
 END_TIMEOUT_S = 20.0
+BEATS = 4  # signs of life in the time that the service manager allows; it asks for two
 
 
 class AddressInUse(MastctlError):
@@ -82,22 +84,14 @@ def run(
     Raises AddressInUse, StateInUse before the hardware is touched; BadFile, DriverError.
     """
     sys.setswitchinterval(SWITCH_S)
-    with _listening(config.listen) as (listener, url):
-        any_port = config.listen.socket is None and config.listen.port == 0  # it is not found there again
-        folder = StateFolder.of(config.state_folder, config.path, None if any_port else config.listen.url)
-        service = _opened(config, clock, folder, url)
-        _let_log_stall(service)
-        try:
-            rules = _entry_rules(service, url)
+    with _opened(config, clock, own_process=True) as opened:
 
-            def ready(_: Callable[[], None]) -> None:
-                on_ready(url)
-                prepare = partial(_prepare, service, draws_ahead)
-                threading.Thread(target=prepare, name="first pointing", daemon=True).start()
+        def ready(_: Callable[[], None]) -> None:
+            on_ready(opened.url)
+            prepare = partial(_prepare, opened.service, draws_ahead)
+            threading.Thread(target=prepare, name="first pointing", daemon=True).start()
 
-            asyncio.run(_serve(service, listener, ready, rules, in_process=True))
-        finally:
-            service.close()
+        asyncio.run(_serve(opened, ready))
 
 
 class RunningDaemon:
@@ -105,30 +99,17 @@ class RunningDaemon:
 
     def __init__(self, config: Config, clock: Clock | None = None) -> None:
         self._exit = contextlib.ExitStack()
-        try:
-            listener, self.url = self._exit.enter_context(_listening(config.listen))
-            named = config.state_folder  # the program's own, whatever unit it runs in
-            folder = None if named is None else StateFolder.of(named, config.path, self.url)
-            self.service = _opened(config, clock, folder, self.url)
-            self._exit.callback(self.service.close)
-            self._entrance = _entry_rules(self.service, self.url)
-        except BaseException:
-            self._exit.close()
-            raise
-        _let_log_stall(self.service)
-        self._exit.callback(stall_while, lambda: False)
-        self._ready = threading.Event()
-        self._ended = threading.Event()
-        self._closing = False
-        self._stop: Callable[[], None] = lambda: None
-        self._thread = threading.Thread(target=self._work, args=(listener,), name="daemon", daemon=True)
+        opened = self._exit.enter_context(_opened(config, clock, own_process=False))
+        self.service, self.url = opened.service, opened.url
+        self._end: Future[Callable[[], None]] = Future()  # what ends it, from the moment that it answers
+        self._thread = threading.Thread(target=self._work, args=(opened,), name="daemon", daemon=True)
         self._thread.start()
-        started = self._ready.wait(START_TIMEOUT_S)
-        if self._ended.is_set() or not started:
-            ended = self._ended.is_set()
+        try:
+            self._end.result(START_TIMEOUT_S)
+        except BaseException as error:
             self.close()
-            how = "ended while it started" if ended else f"did not answer within {START_TIMEOUT_S:g} s"
-            raise MastctlError(f"the daemon {how}; its log says why")
+            message = f"the daemon did not start: {one_line(error, 200) or type(error).__name__}"
+            raise MastctlError(f"{message}; its log states more") from None
 
     @property
     def hardware(self) -> Hardware:
@@ -137,8 +118,7 @@ class RunningDaemon:
 
     def close(self) -> None:
         """Stop the mast, end the daemon, let go of everything; bounded. Does nothing the second time."""
-        self._closing = True  # first: a daemon that is only now ready sees it
-        self._stop()
+        self._end.add_done_callback(lambda end: None if end.exception() else end.result()())
         self._thread.join(END_TIMEOUT_S)
         self._exit.close()
 
@@ -153,41 +133,103 @@ class RunningDaemon:
     ) -> None:
         self.close()
 
-    def _work(self, listener: socket.socket) -> None:
-        def ready(stop: Callable[[], None]) -> None:
-            self._stop = stop
-            self._ready.set()
-            if self._closing:
-                stop()
-
+    def _work(self, opened: _Opened) -> None:
         try:
-            asyncio.run(_serve(self.service, listener, ready, self._entrance, in_process=False))
-        except Exception:
+            asyncio.run(_serve(opened, self._end.set_result))
+        except Exception as error:
             log.exception("the daemon ended")
-        finally:
-            self._ended.set()
-            self._ready.set()
-            self._stop = lambda: None
+            if not self._end.done():
+                self._end.set_exception(error)
 
 
-def _opened(config: Config, clock: Clock | None, folder: StateFolder | None, url: str) -> Service:
-    """Open the service and its socket for stops; let go of the folder if that fails."""
-    try:
+class ServiceManager:
+    """The program that started this process and watches it, as systemd does (sd_notify(3)), or none.
+
+    It gets lines of text as datagrams at ``NOTIFY_SOCKET``. No call waits: a manager that reads nothing loses
+    messages, no more. ``WATCHDOG_USEC`` and ``WATCHDOG_PID`` request signs of life. Two threads give one, one
+    after the other: a turn of the head's thread requests it, and the event loop sends it, by ``in_loop``. If
+    either hangs, nothing is sent: the manager ends the process and runs the command of its unit that stops
+    the head.
+    """
+
+    def __init__(
+        self,
+        environ: Mapping[str, str],
+        in_loop: Callable[[Callable[[], None]], object],
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._address = environ.get("NOTIFY_SOCKET", "")
+        if self._address.startswith("@"):  # of the kernel, without a file
+            self._address = f"\0{self._address[1:]}"
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+        self._socket.setblocking(False)
+        self._in_loop = in_loop
+        self._now_s = now_s
+        microseconds, process = environ.get("WATCHDOG_USEC", ""), environ.get("WATCHDOG_PID", "")
+        watched = microseconds.isdecimal() and process in ("", str(os.getpid()))
+        self._every_s = int(microseconds) / 1e6 / BEATS if watched else 0.0
+        self._next_s = float("-inf")
+        self._requested = False  # the loop has not sent the last one yet
+
+    def send(self, text: str) -> None:
+        """Send a line: ``READY=1``, ``STOPPING=1``, ``STATUS=...`` as ``systemctl status`` shows it."""
+        if self._address:
+            with contextlib.suppress(OSError):  # a manager that is gone, or reads nothing
+                self._socket.sendto(" ".join(text.split()).encode(), self._address)
+
+    def turn(self) -> None:
+        """Take note that the calling thread goes on, at any rate; waits for nothing."""
+        if not self._every_s or self._requested or self._now_s() < self._next_s:
+            return
+        self._next_s = self._now_s() + self._every_s
+        self._requested = True
+        with contextlib.suppress(RuntimeError):  # the loop has ended: so does the process
+            self._in_loop(self._beat)
+
+    def _beat(self) -> None:
+        self._requested = False
+        self.send("WATCHDOG=1")
+
+    def close(self) -> None:
+        """Let go of the socket."""
+        self._socket.close()
+
+
+@dataclass(frozen=True)
+class _Opened:
+    """A service that listens at an address, with the rules for its clients."""
+
+    service: Service
+    listener: socket.socket
+    url: str
+    rules: EntryRules
+    own_process: bool
+
+
+@contextlib.contextmanager
+def _opened(config: Config, clock: Clock | None, *, own_process: bool) -> Iterator[_Opened]:
+    """Take the address, open the service and its socket for stops; leaving stops the mast and closes all.
+
+    Inside another program state is kept in the configuration's folder, or in a temporary one.
+    """
+    listen, folder = config.listen, None
+    with contextlib.ExitStack() as stack:
+        listener, url = stack.enter_context(_listening(listen))
+        if own_process or config.state_folder is not None:
+            any_port = listen.socket is None and listen.port == 0  # it is not found there again
+            folder = StateFolder.of(config.state_folder, config.path, None if any_port else listen.url)
+            stack.callback(folder.close)
         service = Service.open(config, clock, folder)
-    except BaseException:
-        if folder is not None:
-            folder.close()
-        raise
-    try:
-        service.open_stop_socket()
-    except BaseException:
-        service.close()
-        raise
-    socket_path = None if service.stop_socket is None else service.stop_socket.path
-    for kept in (service.folder, service.head_folder):  # a stop finds the daemon of a head by either
-        if kept is not None:
-            kept.note_daemon(config.path, url, socket_path)
-    return service
+        stack.callback(service.close)
+        stop_path = service.open_stop_socket()
+        for kept in (service.folder, service.head_folder):  # a stop finds the daemon of a head by either
+            if kept is not None:
+                kept.note_daemon(config.path, url, stop_path)
+        rover = service.hardware.simulation
+        if rover is not None:  # a fault of it delays this process' log, as an unread pipe does
+            stall_while(lambda: rover.faults.find(LOG, "stalled", service.clock.now_s()) is not None)
+            stack.callback(stall_while, lambda: False)
+        yield _Opened(service, listener, url, _entry_rules(service, url), own_process)
 
 
 def _prepare(service: Service, draws_ahead: bool) -> None:
@@ -199,31 +241,18 @@ def _prepare(service: Service, draws_ahead: bool) -> None:
         rover.draw_ahead(service.clock.now_s())
 
 
-def _let_log_stall(service: Service) -> None:
-    """Let a fault of a simulated rover delay this process' log, as an unread pipe does."""
-    rover, clock = service.hardware.simulation, service.clock
-    if rover is not None:
-        stall_while(lambda: rover.faults.find(LOG, "stalled", clock.now_s()) is not None)
-
-
-async def _serve(
-    service: Service,
-    listener: socket.socket,
-    on_ready: Callable[[Callable[[], None]], None],
-    entrance: EntryRules,
-    *,
-    in_process: bool,
-) -> None:
+async def _serve(opened: _Opened, on_ready: Callable[[Callable[[], None]], object]) -> None:
     """Serve until the end is requested; ``on_ready`` gets a function that requests it, from any thread.
 
     With a process of its own the signals are the daemon's, and the service is closed under their rule too.
     """
     loop = asyncio.get_running_loop()
+    service, own_process, access = opened.service, opened.own_process, opened.rules.access
     waiting = Waiting(service.clock)
     streams = Streams(service.machine.publisher)
     feeds = CameraFeeds(service.devices, service.clock)
     silent = SilentConnections()
-    app = create_app(Parts(service, waiting, streams, entrance, feeds))
+    app = create_app(Parts(service, waiting, streams, opened.rules, feeds))
     server = uvicorn.Server(_settings(app, silent))
     ending = asyncio.Event()
 
@@ -236,36 +265,38 @@ async def _serve(
         with contextlib.suppress(RuntimeError):  # the loop has ended already
             loop.call_soon_threadsafe(end)
 
-    manager = ServiceManager() if in_process else ServiceManager({})
-    service.devices.on_turn = Heartbeat(manager, loop.call_soon_threadsafe).turn
-    if in_process:
+    manager = ServiceManager(os.environ if own_process else {}, loop.call_soon_threadsafe)
+    service.devices.on_turn = manager.turn
+    if own_process:
         for number in signals.wanted():
             loop.add_signal_handler(number, end)
         if signal.getsignal(signal.SIGTSTP) is not signal.SIG_IGN:
             loop.add_signal_handler(signal.SIGTSTP, _suspend, service)
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    serving = asyncio.create_task(server.serve(sockets=[listener]))
+    serving = asyncio.create_task(server.serve(sockets=[opened.listener]))
     while not server.started and not serving.done():
         await asyncio.sleep(0.005)
     if serving.done():  # an address that does not answer is not announced; the caller closes the service
         await serving
         raise MastctlError("the web server ended before it answered a request")
-    listener.listen(WAITING_IN_KERNEL)  # asyncio has one number for this and for how many it takes at once
+    opened.listener.listen(
+        WAITING_IN_KERNEL
+    )  # asyncio has one number for this and for how many it takes at once
     beside = [asyncio.create_task(_report_state(service, manager)), asyncio.create_task(silent.watch())]
-    if entrance.access is not None:
-        beside.append(asyncio.create_task(_reread_tokens(entrance.access, waiting, streams)))
-    if in_process:
+    if access is not None:
+        beside.append(asyncio.create_task(_reread_tokens(access, waiting, streams)))
+    if own_process:
         for number, handler in handlers.items():  # uvicorn has set its own: the mast is stopped first
             signal.signal(number, handler)
         # Objects of the start stay. Each full collection of them stopped every thread for some 80 ms.
         gc.collect()
         gc.freeze()
     on_ready(end_from_anywhere)
-    manager.ready()
+    manager.send("READY=1")
     requested = asyncio.create_task(ending.wait())
     await asyncio.wait({serving, requested}, return_when=asyncio.FIRST_COMPLETED)
     requested.cancel()
-    manager.stopping()
+    manager.send("STOPPING=1")
     try:
         stopped = asyncio.wrap_future(service.stop_threads.submit(service.operations.close))
     except StopsHang:
@@ -279,8 +310,9 @@ async def _serve(
     await serving
     for task in beside:
         task.cancel()
-    if in_process:
+    if own_process:
         await asyncio.to_thread(service.close)
+    manager.close()
 
 
 async def _reread_tokens(access: Access, waiting: Waiting, streams: Streams) -> None:
@@ -298,7 +330,7 @@ async def _report_state(service: Service, manager: ServiceManager) -> None:
         while not changes.closed:
             for change in await changes.wait():
                 now = change.value
-                manager.status(f"{now.state}: {now.reason}" if now.reason else now.state)
+                manager.send(f"STATUS={now.state}: {now.reason}" if now.reason else f"STATUS={now.state}")
 
 
 def _settings(app: ASGIApp, silent: SilentConnections) -> uvicorn.Config:

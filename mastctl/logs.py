@@ -1,8 +1,8 @@
-"""Logs that never delay their callers: how a record becomes a line, and a thread that writes it.
+"""Logs that never delay their callers: how a record becomes a line, and a stream that a thread writes.
 
 An unread pipe, a stopped terminal or a disk that hangs blocks a process in its next write, and with it every
-thread that waits for a lock of the writer. Of this module only the writing thread is blocked. Messages that
-do not fit into the queue meanwhile are dropped and counted; the count is logged when the output flows again.
+thread that waits for a lock of the writer. Of this module only the writing thread is blocked. Texts that do
+not fit into the queue meanwhile are dropped and counted; the count is logged when the output flows again.
 """
 
 from __future__ import annotations
@@ -16,18 +16,19 @@ import select
 import sys
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Mapping
 from functools import cache
-from queue import SimpleQueue
+from queue import Full, Queue
 from typing import Literal
+
+log = logging.getLogger(__name__)
 
 LogFormat = Literal["text", "json"]
 
 TEXT = "%(levelname)s %(name)s: %(message)s"
 
-_PRIORITIES = ((logging.CRITICAL, 2), (logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
-"""Priorities of syslog(3), which journald reads from ``<N>`` before a line; lower levels are 7."""
+_PRIORITIES = {logging.CRITICAL: 2, logging.ERROR: 3, logging.WARNING: 4, logging.INFO: 6, logging.DEBUG: 7}
+"""Priorities of syslog(3), which journald reads from ``<N>`` before a line."""
 
 
 class JsonLines(logging.Formatter):
@@ -52,11 +53,7 @@ class JsonLines(logging.Formatter):
         if record.exc_info:
             fields["traceback"] = self.formatException(record.exc_info)
         line = json.dumps(fields)
-        return f"<{_priority(record.levelno)}>{line}" if self._priorities else line
-
-
-def _priority(level: int) -> int:
-    return next((priority for least, priority in _PRIORITIES if level >= least), 7)
+        return f"<{_PRIORITIES.get(record.levelno, 6)}>{line}" if self._priorities else line
 
 
 def to_journal(descriptor: int, environ: Mapping[str, str] = os.environ) -> bool:
@@ -77,12 +74,9 @@ def formatter(wanted: LogFormat | None, descriptor: int | None = None) -> loggin
     return logging.Formatter(TEXT)
 
 
-KEPT = 1000  # messages that wait for an output that does not flow
+KEPT = 1000  # texts that wait for an output that does not flow
 FLUSH_S = 1.0
-
 STALLED_S = 0.05
-
-Message = str | Callable[[], str]
 
 _stalls: list[Callable[[], bool]] = []
 
@@ -92,137 +86,88 @@ def stall_while(stalled: Callable[[], bool]) -> None:
     _stalls[:] = [stalled]
 
 
-class QueuedWriter:
-    """Writes text to a file descriptor, in the order given, from a thread of its own; ``kept`` may wait.
-
-    ``own_line`` makes a line of a message of the writer itself.
-    """
-
-    def __init__(self, descriptor: int, kept: int = KEPT) -> None:
-        self.descriptor = descriptor
-        self._kept = kept
-        self._queue: SimpleQueue[Message | threading.Event] = SimpleQueue()
-        self._dropped = deque[None]()  # one for each dropped message
-        self.own_line: Callable[[str], str] = lambda message: f"mastctl: {message}\n"
-        threading.Thread(target=self._work, name="output", daemon=True).start()
-
-    def put(self, message: Message) -> None:
-        """Have a text written, or a function's result, made in the writing thread; returns at once."""
-        if self._queue.qsize() >= self._kept:
-            self._dropped.append(None)
-            return
-        if self._dropped:
-            self._queue.put(self._dropped_line)
-        self._queue.put(message)
-
-    def flush(self, timeout_s: float = FLUSH_S) -> bool:
-        """Wait until all of before is written, ``timeout_s`` seconds at most; return whether it is."""
-        written = threading.Event()
-        self._queue.put(written)
-        return written.wait(timeout_s)
-
-    def _dropped_line(self) -> str:
-        dropped = 0
-        with contextlib.suppress(IndexError):
-            while True:
-                self._dropped.popleft()
-                dropped += 1
-        if not dropped:
-            return ""
-        return self.own_line(f"{dropped} messages were dropped here while this output was not read")
-
-    # In the writing thread
-
-    def _work(self) -> None:
-        while True:
-            entry = self._queue.get()
-            if not isinstance(entry, threading.Event):
-                self._write(entry)
-            if self._dropped and self._queue.empty():
-                self._write(self._dropped_line)
-            if isinstance(entry, threading.Event):
-                entry.set()
-
-    def _write(self, message: Message) -> None:
-        """Write one message whole; it is lost where nothing can be written (closed, disk full)."""
-        try:
-            text = message if isinstance(message, str) else message()
-        except Exception as error:  # of its formatting, which must not end the thread
-            text = self.own_line(f"a message could not be put into words: {type(error).__name__}")
-        left = text.encode("utf-8", "backslashreplace")
-        while left:
-            while any(stalled() for stalled in _stalls):
-                time.sleep(STALLED_S)
-            try:
-                left = left[os.write(self.descriptor, left) :]
-            except BlockingIOError:  # the process that started this one shares the pipe, without waiting
-                with contextlib.suppress(OSError):
-                    select.select([], [self.descriptor], [])
-            except OSError:
-                return
-
-
-@cache
-def writer_to(descriptor: int) -> QueuedWriter:
-    """Return the one writer to a descriptor, which keeps the messages of several callers in order."""
-    return QueuedWriter(descriptor)
-
-
 class QueuedText(io.TextIOBase):
-    """A text stream on a `QueuedWriter`, in the place of ``sys.stderr`` or ``sys.stdout``; never waits."""
+    """A text stream that never waits: what is written reaches the descriptor from a thread of its own."""
 
     encoding = "utf-8"
 
-    def __init__(self, writer: QueuedWriter) -> None:
-        self._writer = writer
+    def __init__(self, descriptor: int, kept: int = KEPT) -> None:
+        self._descriptor = descriptor
+        self._queue: Queue[str | threading.Event] = Queue(kept)
+        self._dropped = 0
+        threading.Thread(target=self._work, name="output", daemon=True).start()
 
     def writable(self) -> bool:
         return True
 
     def write(self, text: str) -> int:
-        if text:
-            self._writer.put(text)
+        try:
+            self._queue.put_nowait(text)
+        except Full:
+            self._dropped += 1
         return len(text)
 
     def flush(self) -> None:
         """Return at once: the thread writes as soon as it can."""
 
+    def written(self) -> bool:
+        """Wait a second at most for all that was written so far; return whether it is out."""
+        out = threading.Event()
+        with contextlib.suppress(Full):
+            self._queue.put_nowait(out)
+            return out.wait(FLUSH_S)
+        return False
+
     def fileno(self) -> int:
-        return self._writer.descriptor
+        return self._descriptor
 
     def isatty(self) -> bool:
-        return os.isatty(self._writer.descriptor)
+        return os.isatty(self._descriptor)
+
+    def _work(self) -> None:
+        while True:
+            entry = self._queue.get()
+            if isinstance(entry, str):
+                self._write(entry.encode("utf-8", "backslashreplace"))
+            if self._dropped and self._queue.empty():
+                dropped, self._dropped = self._dropped, 0
+                log.warning("%d messages were dropped while an output was not read", dropped)
+            if isinstance(entry, threading.Event):
+                entry.set()
+
+    def _write(self, left: bytes) -> None:
+        """Write one text whole; it is lost where nothing can be written (closed, disk full)."""
+        while left:
+            while any(stalled() for stalled in _stalls):
+                time.sleep(STALLED_S)
+            try:
+                left = left[os.write(self._descriptor, left) :]
+            except BlockingIOError:  # the process that started this one shares the pipe, without waiting
+                with contextlib.suppress(OSError):
+                    select.select([], [self._descriptor], [])
+            except OSError:
+                return
+
+
+@cache
+def queued(descriptor: int) -> QueuedText:
+    """Return the one stream to a descriptor, which keeps the texts of several callers in order."""
+    return QueuedText(descriptor)
 
 
 class QueuedHandler(logging.Handler):
-    """Log records through a `QueuedWriter`: no lock, and formatted in the writing thread."""
+    """Log records by a `QueuedText`."""
 
-    def __init__(self, writer: QueuedWriter) -> None:
+    def __init__(self, stream: QueuedText) -> None:
         super().__init__()
-        self._writer = writer
-
-    def setFormatter(self, fmt: logging.Formatter | None) -> None:
-        """Format records, and messages of the writer itself, by this."""
-        super().setFormatter(fmt)
-        if fmt is not None:
-            about = {"name": "mastctl", "levelno": logging.WARNING, "levelname": "WARNING"}
-            self._writer.own_line = lambda message: (
-                fmt.format(logging.makeLogRecord({**about, "msg": "%s", "args": (message,)})) + "\n"
-            )
-
-    def createLock(self) -> None:
-        self.lock = None
-
-    def handle(self, record: logging.LogRecord) -> bool:
-        """Emit a record that the filters pass; the library's own method takes the lock."""
-        passed = self.filter(record)
-        if passed:
-            self.emit(passed if isinstance(passed, logging.LogRecord) else record)
-        return bool(passed)
+        self._stream = stream
 
     def emit(self, record: logging.LogRecord) -> None:
-        self._writer.put(lambda: self.format(record) + "\n")
+        try:
+            self._stream.write(self.format(record) + "\n")
+        except Exception:  # of a message that cannot be formatted
+            self.handleError(record)
 
     def flush(self) -> None:
         """Wait for the records of before, a second at most."""
-        self._writer.flush()
+        self._stream.written()

@@ -12,17 +12,17 @@ import pytest
 from mastctl.logs import JsonLines, formatter, to_journal
 
 
-def record(level: int, words: str, *args: object) -> logging.LogRecord:
-    return logging.LogRecord("mastctl.service", level, "file.py", 1, words, args, None)
+def record(level: int, message: str, *args: object) -> logging.LogRecord:
+    return logging.LogRecord("mastctl.service", level, "file.py", 1, message, args, None)
 
 
 def test_a_record_is_one_json_object_on_one_line_whatever_it_says() -> None:
     line = JsonLines().format(record(logging.WARNING, 'a "quoted"\nsecond line of %s', "three\x00"))
     assert "\n" not in line
-    told = json.loads(line)
-    assert told["message"] == 'a "quoted"\nsecond line of three\x00'
-    assert (told["level"], told["logger"]) == ("warning", "mastctl.service")
-    assert told["time"].endswith("Z")
+    fields = json.loads(line)
+    assert fields["message"] == 'a "quoted"\nsecond line of three\x00'
+    assert (fields["level"], fields["logger"]) == ("warning", "mastctl.service")
+    assert fields["time"].endswith("Z")
 
 
 def test_a_defect_brings_its_traceback_inside_the_same_object() -> None:
@@ -39,7 +39,7 @@ def test_a_defect_brings_its_traceback_inside_the_same_object() -> None:
     [(logging.DEBUG, "<7>{"), (logging.INFO, "<6>{"), (logging.WARNING, "<4>{"), (logging.ERROR, "<3>{")],
 )
 def test_journald_reads_the_priority_before_the_object(level: int, begins: str) -> None:
-    assert JsonLines(priorities=True).format(record(level, "words")).startswith(begins)
+    assert JsonLines(priorities=True).format(record(level, "message")).startswith(begins)
 
 
 def test_what_goes_to_journald_is_known_by_its_stream(

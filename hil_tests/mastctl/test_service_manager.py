@@ -14,7 +14,7 @@ import pytest
 
 from hil_tests.mastctl.outside_daemon import OUTSIDE, daemon_process, write_config
 from hil_tests.waiting import NET_S
-from mastctl.service_manager import Heartbeat, ServiceManager
+from mastctl.daemon import ServiceManager
 
 
 @pytest.fixture
@@ -26,8 +26,8 @@ def manager(tmp_path: Path) -> Iterator[socket.socket]:
         yield listener
 
 
-def told(listener: socket.socket) -> list[str]:
-    """Everything that was said so far."""
+def messages(listener: socket.socket) -> list[str]:
+    """Everything that was sent so far."""
     found = []
     while True:
         try:
@@ -41,27 +41,31 @@ def environment(listener: socket.socket, **more: str) -> dict[str, str]:
 
 
 def test_each_message_is_a_datagram_as_the_protocol_has_it(manager: socket.socket) -> None:
-    service = ServiceManager(environment(manager))
-    service.ready()
-    service.status("moving:\n two  lines")
-    service.alive()
-    service.stopping()
-    assert told(manager) == ["READY=1", "STATUS=moving: two lines", "WATCHDOG=1", "STOPPING=1"]
+    service = ServiceManager(environment(manager), Loop().soon)
+    service.send("READY=1")
+    service.send("STATUS=moving:\n two  lines")
+    assert messages(manager) == ["READY=1", "STATUS=moving: two lines"]
 
 
 @pytest.mark.parametrize(
-    ("words", "expected"),
+    ("variables", "watched"),
     [
-        ({"WATCHDOG_USEC": "10000000"}, 10.0),
-        ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": str(os.getpid())}, 10.0),
-        ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": "1"}, None),  # another process is watched
-        ({"WATCHDOG_USEC": "0"}, None),
-        ({"WATCHDOG_USEC": "soon"}, None),
-        ({}, None),
+        ({"WATCHDOG_USEC": "10000000"}, True),
+        ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": str(os.getpid())}, True),
+        ({"WATCHDOG_USEC": "10000000", "WATCHDOG_PID": "1"}, False),  # another process is watched
+        ({"WATCHDOG_USEC": "0"}, False),
+        ({"WATCHDOG_USEC": "soon"}, False),
+        ({}, False),
     ],
+    ids=["any", "this", "another", "never", "soon", "none"],
 )
-def test_only_the_process_that_is_meant_is_watched(words: dict[str, str], expected: float | None) -> None:
-    assert ServiceManager(words).watchdog_s == expected
+def test_only_the_process_that_is_meant_is_watched(
+    manager: socket.socket, variables: dict[str, str], watched: bool
+) -> None:
+    loop = Loop()
+    ServiceManager(environment(manager, **variables), loop.soon).turn()
+    loop.run()
+    assert messages(manager) == ["WATCHDOG=1"] * watched
 
 
 class Loop:
@@ -84,30 +88,30 @@ class Loop:
 
 def test_a_sign_of_life_needs_a_turn_of_the_head_and_one_of_the_loop(manager: socket.socket) -> None:
     now, loop = [0.0], Loop()
-    beat = Heartbeat(ServiceManager(environment(manager, WATCHDOG_USEC="8000000")), loop.soon, lambda: now[0])
+    beat = ServiceManager(environment(manager, WATCHDOG_USEC="8000000"), loop.soon, lambda: now[0])
     loop.run()
-    assert told(manager) == []  # the loop alone feeds nobody
+    assert messages(manager) == []  # the loop alone feeds nobody
     beat.turn()
-    assert told(manager) == []  # nor does the head alone
+    assert messages(manager) == []  # nor does the head alone
     loop.run()
-    assert told(manager) == ["WATCHDOG=1"]
+    assert messages(manager) == ["WATCHDOG=1"]
     beat.turn()
     loop.run()
-    assert told(manager) == []  # more often than the manager asks is not told
+    assert messages(manager) == []  # more often than the manager asks is not told
     now[0] = 2.1
     beat.turn()
     loop.run()
-    assert told(manager) == ["WATCHDOG=1"]
+    assert messages(manager) == ["WATCHDOG=1"]
 
 
 def test_a_loop_that_stands_still_is_asked_once_and_not_told_of(manager: socket.socket) -> None:
     now, loop = [0.0], Loop()
-    beat = Heartbeat(ServiceManager(environment(manager, WATCHDOG_USEC="1000000")), loop.soon, lambda: now[0])
+    beat = ServiceManager(environment(manager, WATCHDOG_USEC="1000000"), loop.soon, lambda: now[0])
     for _ in range(1000):
         now[0] += 0.02
         beat.turn()
     assert len(loop.waiting) == 1
-    assert told(manager) == []
+    assert messages(manager) == []
 
 
 # The same from a daemon in a process of its own

@@ -48,16 +48,16 @@ HUNG_DAEMON = (
 
 def queue_output() -> None:
     """Let no output of the daemon wait for its reader, on stderr as on stdout."""
-    from mastctl.logs import QueuedText, writer_to
+    from mastctl.logs import queued
 
     for name in ("stdout", "stderr"):
         try:
             descriptor = getattr(sys, name).fileno()
         except OSError:  # a stream of a test
             continue
-        writer = writer_to(descriptor)
-        setattr(sys, name, QueuedText(writer))
-        atexit.register(writer.flush)
+        stream = queued(descriptor)
+        setattr(sys, name, stream)
+        atexit.register(stream.written)
     signals.write_from_background()
 
 

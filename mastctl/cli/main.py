@@ -25,7 +25,7 @@ from typing import Any, NoReturn
 from mastctl import signals
 from mastctl.cli import output
 from mastctl.cli.options import DECLARED, GROUPS, CommandLine, Parser, add_options
-from mastctl.logs import TEXT, QueuedHandler, writer_to
+from mastctl.logs import TEXT, QueuedHandler, queued
 
 log = logging.getLogger(__name__)
 
@@ -182,7 +182,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if argv is None else argv)
     if not logging.getLogger().handlers:
         # Through a queue: the logs of a driver or a daemon in this process never wait for a reader.
-        handler = QueuedHandler(writer_to(sys.stderr.fileno()))
+        handler = QueuedHandler(queued(sys.stderr.fileno()))
         logging.basicConfig(format=TEXT, level=logging.WARNING, handlers=[handler])
     try:
         with signals.raised():

@@ -12,6 +12,7 @@ import random
 import threading
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -406,14 +407,18 @@ class Service:
             raise wrong_camera(frame, camera)
         return frame
 
-    def open_stop_socket(self) -> None:
-        """Listen for stops in the state folder, or a temporary one if its name is too long for a socket's."""
+    def open_stop_socket(self) -> Path:
+        """Listen for stops in the state folder, or a temporary one if its name is too long for a socket's.
+
+        Returns the socket's path.
+        """
         try:
             self.stop_socket = StopSocket(self.folder.path / stop_socket.FILE, self._stop_by_socket)
         except MastctlError as error:
             log.warning("%s", error)
             self._socket_folder = StateFolder.temporary()
             self.stop_socket = StopSocket(self._socket_folder.path / stop_socket.FILE, self._stop_by_socket)
+        return self.stop_socket.path
 
     def _stop_by_socket(self, verb: Verb, reason: str | None, name: str | None) -> StopAnswer | EstopAnswer:
         """Carry out a stop that came by the socket; return its answer."""

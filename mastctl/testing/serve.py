@@ -29,10 +29,10 @@ def main() -> None:
         with Path(os.devnull).open("rb") as nothing:
             os.dup2(nothing.fileno(), 0)
         os.dup2(2, 1)
-        from mastctl.logs import QueuedHandler, QueuedText, writer_to
+        from mastctl.logs import QueuedHandler, queued
 
-        sys.stdout = sys.stderr = QueuedText(writer_to(2))  # as `mastctl run` says things
-        handler = QueuedHandler(writer_to(2))
+        sys.stdout = sys.stderr = queued(2)  # as `mastctl run` says things
+        handler = QueuedHandler(queued(2))
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         logging.getLogger().addHandler(handler)
         for name in ("mastctl", "drivers", "calib"):
