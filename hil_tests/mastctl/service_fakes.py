@@ -26,7 +26,7 @@ from hil_tests.waiting import NET_S
 from mastctl.answers import Step
 from mastctl.client import Client
 from mastctl.config import load_config
-from mastctl.watch.journal import JournalThread
+from mastctl.drift.journal import JournalThread
 
 if TYPE_CHECKING:
     from mastctl.daemon import RunningDaemon

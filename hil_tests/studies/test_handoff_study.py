@@ -11,7 +11,7 @@ import pytest
 
 from calib.geometry.handoff import Joints, PredictedPixel
 from calib.matching.handoff import Landed, MatchedHandoff, RefinedPixel, RefinedVerdict
-from mastctl.watch.handoffs import read_log
+from mastctl.drift.handoffs import read_log
 from tools.studies import handoff as study
 from tools.studies.handoff import handoff_rows, write_handoffs
 from tools.studies.handoff_run import Handed, HandoffRecord

@@ -4,9 +4,10 @@ its true pose, boards, time and faults.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NotRequired
 
 from annotated_types import Ge, Gt, Len
+from pydantic import ConfigDict, with_config
 from typing_extensions import TypedDict
 
 from mastctl.answers.status import (
@@ -101,21 +102,22 @@ class TargetList(TypedDict):
 
 
 class CameraTurn(TypedDict):
-    """How far a camera seems turned, by the axes of the frame that it is mounted on."""
+    """How far a camera, or both of a pair, seem turned, by the axes of the frame that they are mounted on."""
 
     turn_rad: Point
     sigma_rad: Point
     log10_evidence: float
 
 
+@with_config(ConfigDict(allow_inf_nan=False))
 class MeasuredPointing(TypedDict):
-    """A pointing of which a new picture was taken.
+    """A pointing of which a new image was taken, or one camera's part of a hand-off.
 
     ``time_s`` since 1970 (UTC); ``source``, ``partner``: the pair that gave the position, the clicked camera
     first; ``camera``: the one that was aimed. ``from_rad``, ``to_rad``: true pan and tilt at the pair's
     images and at the new image. ``position_m`` in the rover frame, ``range_m`` from the aimed camera.
     ``off_px``: the part of the residual that measured joints do not explain; ``count_rad``: one count of each
-    encoder.
+    encoder; ``click_sigma_px``: of the target in the pair's images, where it is not the usual one.
     """
 
     time_s: float
@@ -133,6 +135,7 @@ class MeasuredPointing(TypedDict):
     off_px: Pixel
     match_sigma_px: Annotated[list[Annotated[float, Gt(0.0)]], Len(2, 2)]
     count_rad: Annotated[list[Annotated[float, Ge(0.0)]], Len(2, 2)]
+    click_sigma_px: NotRequired[Annotated[float, Gt(0.0)]]
 
 
 class CountedPointing(MeasuredPointing):
@@ -152,7 +155,6 @@ class ResidualVerdict(CalibrationAnswer):
     times_expected: float | None
     log10_evidence: float | None
     log10_threshold: float
-    false_alarms_per_day: float
     cameras: dict[str, CameraTurn]
 
 
@@ -160,9 +162,8 @@ class CalibrationReport(ResidualVerdict):
     """``GET /calibration/health``: the verdict, its figures, the newest pointings that count, and the result
     of the drift sentinel's looks."""
 
-    write_error: str | None
     newest: list[CountedPointing]
-    sentinel: SentinelAnswer | None
+    sentinel: SentinelAnswer
 
 
 class RecordingListed(TypedDict):

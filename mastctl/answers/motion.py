@@ -224,28 +224,8 @@ class Handover(TypedDict):
     range_m: float
 
 
-class OffsetAnswer(TypedDict):
-    """The offset, beyond chance, of hand-offs from ``source`` to ``camera``: found less predicted."""
-
-    source: str
-    camera: str
-    handoffs: Count
-    left_out: Count
-    offset_px: Pixel
-    sigma_px: Pixel
-    sigmas: float
-    sentence: str
-
-
-class SelfCheck(TypedDict):
-    """How the mast file in use agrees with the hand-offs."""
-
-    handoffs: Count
-    offsets: list[OffsetAnswer]
-
-
-class TrackFacts(TypedDict):
-    """How a track stands, without what its hand-offs say of the mast file."""
+class TrackAnswer(TypedDict):
+    """``GET /track``, and each event of ``GET /track/stream``."""
 
     sequence: Count
     state: TrackState
@@ -268,12 +248,6 @@ class TrackFacts(TypedDict):
     covariance_m2: Annotated[list[Point], Len(3, 3)] | None
     pose: PoseAnswer | None
     age_s: Seconds
-
-
-class TrackAnswer(TrackFacts):
-    """``GET /track``, and each event of ``GET /track/stream``."""
-
-    self_check: SelfCheck
 
 
 class PoseTaken(TypedDict):

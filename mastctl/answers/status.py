@@ -224,8 +224,8 @@ class SentinelAnswer(TypedDict):
 
 
 class CalibrationAnswer(TypedDict):
-    """Whether the mast file still holds, by residuals, reference pictures and hand-offs; ``since`` (ISO 8601,
-    UTC) where it does not."""
+    """Whether the mast file is still valid, by all kinds of evidence; ``since`` (ISO 8601, UTC) where it is
+    not."""
 
     verdict: Literal["good", "drifts", "few", "unknown"]
     sentence: str
@@ -304,8 +304,8 @@ class Status(StateFacts):
     track: TrackBrief
     control: ControlAnswer | None
     stop_socket: str | None
-    calibration: CalibrationAnswer | None
-    sentinel: SentinelAnswer | None
+    calibration: CalibrationAnswer
+    sentinel: SentinelAnswer
     cameras: dict[str, CameraAnswer]
     faults: list[FaultAnswer]
     mast: MastAnswer

@@ -23,9 +23,9 @@ from calib.files.mast_file import StoredRig
 from calib.files.yaml_text import plain
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rig import Rig
-from calib.matching.handoff import MatchedHandoff, handoff_bias
+from calib.matching.handoff import HandoffBias, MatchedHandoff, handoff_bias
 from mastctl.calibration.run import made, picked, rounded_matrix
-from mastctl.watch.handoffs import ReadLog, bias_record
+from mastctl.drift.handoffs import ReadLog
 
 SHIFT_FIRST = (3, 4, 5, 0, 1, 2)
 """In files and on the terminal a correction is its shift, then its turn."""
@@ -61,7 +61,7 @@ def refine(mast: StoredRig, logs: Sequence[ReadLog]) -> tuple[dict[str, Any], Ri
         "former": {"path": str(mast.path), "digest": mast.digest},
         "corrections": {group: _pose_as_json(pose) for group, pose in poses.items()},
         "refusals": {group: {"code": one.code, "message": str(one)} for group, one in refusals.items()},
-        "bias": [bias_record(one) for one in handoff_bias(handoffs)],
+        "bias": [_bias_as_json(one) for one in handoff_bias(handoffs)],
         "handoffs": len(handoffs),
         "other_mast": other_mast,
     }
@@ -99,6 +99,15 @@ def _corrected(mast: StoredRig, significant: dict[str, BodyPose], logs: Sequence
     former = {"former_file": mast.path.name, "former_digest": mast.digest}
     refined = [*(before if isinstance(before, list) else [before]), {**former, **by, **made()}]
     return replace(rig, fit=fit, provenance={**mast.rig.provenance, "refined": refined})
+
+
+def _bias_as_json(bias: HandoffBias) -> dict[str, Any]:
+    """A camera's mean offset as JSON."""
+    return {
+        **picked(bias, "source", "camera", "handoffs", "left_out", "sigmas", "sentence"),
+        "offset_px": bias.offset_px.tolist(),
+        "sigma_px": np.sqrt(np.diag(bias.covariance_px2)).tolist(),
+    }
 
 
 def _pose_as_json(pose: BodyPose) -> dict[str, Any]:

@@ -106,7 +106,7 @@ def _refine(args: argparse.Namespace) -> Answer:
     from calib.files.mast_file import load_rig
     from mastctl.calibration.refined import refine
     from mastctl.calibration.run import save_new
-    from mastctl.watch.handoffs import read_log
+    from mastctl.drift.handoffs import read_log
 
     for name in ("model", "report", "in_use", "method", "mast"):
         if getattr(args, name) is not None:

@@ -84,8 +84,8 @@ def _served(args: argparse.Namespace) -> int:
 def _what_if(args: argparse.Namespace, recording: Recording) -> Answer:
     """Evaluate a recording's pointings and hand-offs again."""
     from calib.files.mast_file import load_rig
+    from mastctl.drift.handoffs import handoff_of
     from mastctl.recorder.what_if import WhatIf, handoffs_with, pointings_with, seen_in, write_what_if
-    from mastctl.watch.handoffs import handoff_of
 
     mast = load_rig(args.mast)
     frames = {name: frame.facts for name, frame in recording.frames.items()}

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote
@@ -27,7 +26,7 @@ GROUPS |= {
     "rig sentinel": "notice a bumped camera, a slipped joint, a lens refocused",
 }
 
-TRACK = "state pair range_m position_m predicted operation reason self_check.offsets.sentence"
+TRACK = "state pair range_m position_m predicted operation reason"
 """What people see of a track."""
 
 FOR = option("--for S", "how long, seconds up to 3600 (default: 30, or as before)", dest="for_s")
@@ -315,29 +314,19 @@ def _pose(text: str) -> tuple[float, float]:
     return angle_rad(angles[0]), angle_rad(angles[1])
 
 
-@contextmanager
-def _steering(args: argparse.Namespace, client: Client) -> Iterator[None]:
-    """Steer alone: under the lease that was named, or one of its own."""
-    if args.lease is not None:
-        yield
-        return
-    with client.lease("sentinel", for_s=120.0, ends_with_stop=True):
-        yield
-
-
 @command(
     "rig sentinel reference",
     option("--pose PAN,TILT", "a pose, radians (default: six)", type=_pose, repeat=True),
     FOLDER,
     *DAEMON,
-    help="take the reference pictures",
+    help="take the reference images",
     example="--folder sentinel --pose 0,-0.3",
 )
 def _reference(args: argparse.Namespace) -> Answer:
-    from mastctl.watch.looks import head_cameras, take_pictures, usual_rests
-    from mastctl.watch.sentinel import now_utc, save_reference
+    from mastctl.drift.looks import head_cameras, steering, take_pictures, usual_rests
+    from mastctl.drift.pictures import now_utc, save_reference
 
-    with client_of(args) as client, _steering(args, client):
+    with client_of(args) as client, steering(client, args.lease):
         rests = args.pose or usual_rests(client)
         _, cameras = head_cameras(client)
         if not cameras:
@@ -345,13 +334,10 @@ def _reference(args: argparse.Namespace) -> Answer:
         with output.waiting(args.json, f"taking images at {len(rests)} poses"):
             pictures, missing = take_pictures(client, rests, cameras)
     if missing:
-        which, why = next(iter(missing.items()))
-        raise CommandError("no_picture", f"no reference was taken: {which}: {why}")
+        place, reason = next(iter(missing.items()))
+        raise CommandError("no_picture", f"no reference was taken: {place}: {reason}")
     saved = save_reference(args.folder, now_utc(), rests, pictures)
-    document = {
-        "folder": str(args.folder), "pictures": len(saved.pictures), "rests": [list(rest) for rest in rests]
-    }  # fmt: skip
-    return Answer(document)
+    return Answer({"folder": str(args.folder), "pictures": len(saved.views), "rests": saved.rests})
 
 
 @command(
@@ -362,13 +348,13 @@ def _reference(args: argparse.Namespace) -> Answer:
     example="--folder sentinel",
 )
 def _look(args: argparse.Namespace) -> Answer:
-    from mastctl.watch.looks import look_again
-    from mastctl.watch.sentinel import add_look, read_reference
+    from mastctl.drift.looks import look_again, steering
+    from mastctl.drift.pictures import add_look, read_reference
 
     reference = read_reference(args.folder)
     with (
         client_of(args) as client,
-        _steering(args, client),
+        steering(client, args.lease),
         output.waiting(args.json, f"comparing {len(reference.rests)} poses"),
     ):
         drift = look_again(client, reference)
@@ -376,12 +362,12 @@ def _look(args: argparse.Namespace) -> Answer:
 
 
 def _standing(args: argparse.Namespace, look: dict[str, Any] | None) -> Answer:
-    from mastctl.watch.sentinel import read_looks, read_reference, standing
+    from mastctl.drift.pictures import read_looks, read_reference, standing
 
     reference = read_reference(args.folder)
     now = standing(reference, read_looks(args.folder, reference))
     document = {name: now[name] for name in ("level", "sentence", "since", "looks")} | {"look": look}
-    missing = [f"{which}: no picture: {why}" for which, why in (look or {}).get("missing", {}).items()]
+    missing = [f"{place}: no image: {reason}" for place, reason in (look or {}).get("missing", {}).items()]
     return Answer(document, [now["sentence"], *missing], 1 if now["level"] == "bad" else 0)
 
 
@@ -397,7 +383,7 @@ def _standing(args: argparse.Namespace, look: dict[str, Any] | None) -> Answer:
     example="--folder sentinel --every-s 86400",
 )
 def _watch(args: argparse.Namespace) -> int:
-    from mastctl.watch.looks import watch
+    from mastctl.drift.looks import watch
 
     def report(look: dict[str, Any]) -> None:
         output.show(args, _standing(args, look))

@@ -21,7 +21,7 @@ from calib.geometry.rigid import FloatArray, Rigid, carried_covariance, quaterni
 from calib.matching.handoff import MatchedHandoff
 from calib.matching.track import Track, moved_track
 from drivers.clock import Clock
-from mastctl.answers import Handover, PoseAnswer, TrackFacts, TrackState
+from mastctl.answers import Handover, PoseAnswer, TrackAnswer, TrackState
 from mastctl.as_json import as_json
 from mastctl.control.machine import StateMachine
 from mastctl.control.operations import Operation, OperationRunner
@@ -180,7 +180,7 @@ class TrackStatus:
         moved = moved_track(track, motion, covariance)
         return replace(self, reason=reason, track=moved, stands_at=pose, owed=None)
 
-    def as_json(self, now_s: float) -> TrackFacts:
+    def as_json(self, now_s: float) -> TrackAnswer:
         """Return it as ``GET /track`` has it."""
         position, covariance = self.position_m, self.covariance_m2
         in_site = position

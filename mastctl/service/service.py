@@ -24,7 +24,6 @@ from drivers.clock import Clock, SystemClock
 from drivers.hardware import Hardware, clock_for, head_name
 from drivers.simulation_clock import SimulationClock
 from mastctl.answers import (
-    CalibrationAnswer,
     CameraAnswer,
     EstopAnswer,
     KeptTarget,
@@ -55,6 +54,9 @@ from mastctl.devices.devices import Devices
 from mastctl.devices.frames import OPERATIONS, StampedFrame, check_known, random_run
 from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.opening import open_rig
+from mastctl.drift.handoffs import line_of
+from mastctl.drift.journal import JournalThread
+from mastctl.drift.watch import DriftWatch
 from mastctl.errors import MastctlError, NotNow
 from mastctl.motion.jog import Jogs
 from mastctl.motion.requests import wrong_camera
@@ -70,14 +72,10 @@ from mastctl.safety.latch import Latch
 from mastctl.safety.state_folder import StateFolder, head_folders
 from mastctl.safety.stop_socket import StopSocket, Verb
 from mastctl.service.masts import MastInUse, Masts, configured, read_mast
+from mastctl.service.metrics import Metrics
 from mastctl.service.places import places, targets
 from mastctl.service.steering import Steering
 from mastctl.service.stopping import Stopping, StopThreads, state_faults
-from mastctl.watch.handoffs import HandoffCheck, line_of
-from mastctl.watch.journal import JournalThread
-from mastctl.watch.metrics import Metrics
-from mastctl.watch.residuals import CalibrationHealth, mast_verdict
-from mastctl.watch.sentinel import SENTINEL_FOLDER, SentinelFindings
 
 log = logging.getLogger(__name__)
 
@@ -120,11 +118,17 @@ class Service:
         self.machine = StateMachine(clock, latched=self.latch.entries)
         publisher = self.machine.publisher
         self.journals = JournalThread(clock)
-        self.health = CalibrationHealth(self.folder.path, mast.stored, self.journals)
+        self.drift = DriftWatch(
+            self.folder.path,
+            config.tracking.handoff_log,
+            mast.stored,
+            lambda digest: self.panoramas.slip(digest),
+            self.journals,
+            clock,
+        )
         self._open_head(mast)
         publisher.publish("track", "track", self.tracker.status)
         self.stop_threads = StopThreads()
-        self.handoffs = HandoffCheck(config.tracking.handoff_log, mast.stored.digest, clock, self.journals)
         self.recorder = Recorder(
             config.record,
             config.record.folder or self.folder.path / RECORDS_FOLDER,
@@ -154,9 +158,6 @@ class Service:
             self.leases,
             publisher,
             hardware.kind == "simulated",
-        )
-        self.sentinel = SentinelFindings(
-            self.folder.path / SENTINEL_FOLDER, lambda: self.stored.digest, self.journals
         )
         self.metrics = Metrics(
             self.status,
@@ -215,7 +216,7 @@ class Service:
             clock,
             self.operations,
             self.tracker,
-            self.health,
+            self.drift,
             self.panoramas,
             config.repeat_after_s,
         )
@@ -278,8 +279,8 @@ class Service:
             "track": {"state": track.state, "reason": track.reason, "id": track.id},
             "control": self.leases.control(),
             "stop_socket": None if self.stop_socket is None else str(self.stop_socket.path),
-            "calibration": self.mast_verdict(),
-            "sentinel": self.sentinel.summary(),
+            "calibration": self.drift.verdict(),
+            "sentinel": self.drift.pictures,
             "cameras": {
                 name: camera_answer(frame, now_s) for name, frame in self.devices.newest_frames().items()
             },
@@ -299,16 +300,9 @@ class Service:
             return {"control": self.leases.control()}
         return published_value(topic, value, self.clock.now_s())
 
-    def mast_verdict(self) -> CalibrationAnswer:
-        """Return whether the mast file still holds, by all kinds of evidence."""
-        looks, handoffs = self.sentinel.summary(), self.handoffs.summary()
-        slip = self.panoramas.slip(self.stored.digest)
-        return mast_verdict(self.health.verdict, looks, handoffs, slip)
-
     def track_answer(self, status: TrackStatus | None = None) -> TrackAnswer:
-        """Return the track, as it is or was, and the self-check of now, as ``GET /track`` has them."""
-        track = (status or self.tracker.status).as_json(self.clock.now_s())
-        return {**track, "self_check": self.handoffs.summary()}
+        """Return the track, as it is or was, as ``GET /track`` has it."""
+        return (status or self.tracker.status).as_json(self.clock.now_s())
 
     def keep_target(self, name: str, body: Any) -> dict[str, KeptTarget]:
         """Keep a target by a name and return all; in the site frame, if a pose is known.
@@ -463,7 +457,7 @@ class Service:
     def _own_faults(self) -> tuple[StandingFault, ...]:
         """What is wrong with the daemon's own files; takes no lock."""
         return (
-            *self.handoffs.faults(),
+            *self.drift.faults(),
             *self.journals.faults(),
             *self.recorder.faults(),
             *self.audit.faults(),
@@ -478,8 +472,7 @@ class Service:
         self.devices.use_rig(stored.rig, stored.digest)
         self.steering.rig = rig
         self.tracker.use_rig(rig, mast.path.name)
-        self.handoffs.use_mast(stored.digest)
-        self.health.use_mast(stored)
+        self.drift.use_mast(stored)
 
     def _steered(self) -> None:
         """Publish which client steers."""
@@ -495,7 +488,7 @@ class Service:
 
     def _handed_over(self, handoff: MatchedHandoff) -> None:
         """Have a hand-off counted and recorded."""
-        self.handoffs.add(handoff)
+        self.drift.handed_over(handoff)
         self.recorder.add_handoff(line_of(handoff))
 
 

@@ -15,6 +15,7 @@ from mastctl.control.operations import Operation, OperationRunner
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import check_known
 from mastctl.devices.judge import Limits
+from mastctl.drift.watch import DriftWatch
 from mastctl.errors import NotNow, Stopped
 from mastctl.motion.loop import PointingLoop
 from mastctl.motion.requests import (
@@ -29,7 +30,6 @@ from mastctl.motion.settings import PointingSettings
 from mastctl.motion.track import ACTIVE, RoverPose, Tracker
 from mastctl.panorama.panoramas import Panoramas
 from mastctl.service.masts import Masts
-from mastctl.watch.residuals import CalibrationHealth
 
 R = TypeVar("R", bound=TrackRequest)
 
@@ -53,7 +53,7 @@ class Steering:
     """Where the head is sent, and the target that it follows; safe to use from any thread.
 
     ``masts`` keeps the mast file the same while a request is judged and begun; ``rig`` is its part that is
-    configured; ``health`` gets each pointing's end. ``repeat_after_s``: as of
+    configured; ``drift`` gets each pointing's end. ``repeat_after_s``: as of
     `mastctl.motion.settings.PointingSettings`; None for its default.
     """
 
@@ -65,7 +65,7 @@ class Steering:
         clock: Clock,
         operations: OperationRunner,
         tracker: Tracker,
-        health: CalibrationHealth,
+        drift: DriftWatch,
         panoramas: Panoramas,
         repeat_after_s: float | None = None,
     ) -> None:
@@ -75,7 +75,7 @@ class Steering:
         self._clock = clock
         self._operations = operations
         self._tracker = tracker
-        self._health = health
+        self._drift = drift
         self.rig = rig
         self._settings = PointingSettings()
         if repeat_after_s is not None:
@@ -102,7 +102,7 @@ class Steering:
                 with self._devices.exposure_held():
                     return loop(record, cancelled).run(request, view_rad)
 
-            return self._operations.start(recorded, run, partial(self._health.ended, mast.stored))
+            return self._operations.start(recorded, run, partial(self._drift.ended, mast.stored))
 
     def preview(self, request: PointRequest, cancelled: threading.Event) -> Preview:
         """Return what a pixel of a named frame shows and where the head would go; nothing moves.

@@ -10,8 +10,7 @@ from mastctl.control.lease import Caller
 from mastctl.errors import Unable
 from mastctl.http import PREFIX
 from mastctl.http.guard import cookie_name, from_this_machine, shown_token
-from mastctl.watch.metrics import CONTENT_TYPE
-from mastctl.watch.sentinel import SENTINEL_FOLDER, findings
+from mastctl.service.metrics import CONTENT_TYPE
 from mastctl.web.commands import Here, caller_of, file_of
 
 COOKIE_S = 12 * 3600
@@ -53,21 +52,11 @@ def add_watching(app: FastAPI) -> None:
         summary="Whether the mast file still holds, with the figures of the last days' residuals",
     )
     async def calibration(here: Here) -> answers.CalibrationReport:
-        service = here.service
-        health = service.health
-        return {
-            **health.verdict,
-            **service.mast_verdict(),
-            "write_error": health.write_error,
-            "newest": health.newest(),
-            "sentinel": service.sentinel.summary(),
-        }
+        return here.service.drift.report()
 
     @app.get(f"{PREFIX}/sentinel", summary="The findings of the drift sentinel, and the age of its last look")
     async def sentinel(here: Here) -> answers.SentinelAnswer:
-        service = here.service
-        folder = service.folder.path / SENTINEL_FOLDER
-        return await here.waiting.run(lambda: findings(folder, service.stored.digest))
+        return here.service.drift.pictures
 
 
 def add_sessions(app: FastAPI) -> None:

@@ -26,8 +26,8 @@ from mastctl.cli.options import add_options, at_least
 from mastctl.cli.output import check_folder
 from mastctl.client import Client
 from mastctl.config import load_config
+from mastctl.drift.handoffs import handoff_log, line_of
 from mastctl.experiment.simulated import Rover, running_rover, simulation_truth
-from mastctl.watch.handoffs import handoff_log
 from tools.command import end, options, show
 from tools.studies.handoff_run import STEPS, HandoffRecord, run_handoff_experiment
 
@@ -105,7 +105,7 @@ def write_handoffs(folder: Path, records: Sequence[HandoffRecord]) -> None:
     log.path.unlink(missing_ok=True)
     for record in records:
         if record.matched is not None:
-            log.append(record.matched)
+            log.append(line_of(record.matched))
 
 
 def bias_sentences(records: Sequence[HandoffRecord]) -> list[str]:

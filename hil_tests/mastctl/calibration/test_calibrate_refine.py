@@ -26,7 +26,7 @@ from hil_tests.calib.matching.handed_over import (
     vectors,
 )
 from mastctl.cli.main import main
-from mastctl.watch.handoffs import handoff_log
+from mastctl.drift.handoffs import handoff_log, line_of
 
 TURN_RAD = (0.0, 0.004, 0.003)
 SHIFT_M = (0.002, 0.0, -0.002)
@@ -64,7 +64,7 @@ def record(
     made = hand_offs(true, stored.rig, targets(rng, count), rng, digest=stored.digest)
     made = [replace(one, time=f"2026-01-01T00:00:{i:02d}Z") for i, one in enumerate(made)]
     for one in made:
-        handoff_log(path).append(one)
+        handoff_log(path).append(line_of(one))
     return made
 
 

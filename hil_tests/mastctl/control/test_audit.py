@@ -16,7 +16,7 @@ from drivers.clock import SystemClock
 from hil_tests.mastctl.service_fakes import Hang, on_disk
 from hil_tests.waiting import NET_S
 from mastctl.control.entry import WAITING, AuditLog
-from mastctl.watch.journal import JournalThread
+from mastctl.drift.journal import JournalThread
 
 CLOCK = SystemClock()
 

@@ -27,8 +27,8 @@ from mastctl.control.entry import (
 from mastctl.control.lease import Caller, LeaseTable
 from mastctl.control.operations import OperationRunner
 from mastctl.control.publisher import Publisher
+from mastctl.drift.journal import JournalThread
 from mastctl.errors import MastctlError, NotNow
-from mastctl.watch.journal import JournalThread
 
 BENCH = Caller("bench")
 ROVER = Caller("rover")

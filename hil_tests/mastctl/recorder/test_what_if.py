@@ -14,8 +14,8 @@ import pytest
 
 from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.rig import Mast, Rig
+from hil_tests.mastctl.drift.small_rover import small
 from hil_tests.mastctl.recorder.recorder_world import CONFIG
-from hil_tests.mastctl.watch.small_rover import small
 from mastctl.cli.main import main
 from mastctl.client import Client
 from mastctl.config import Listen, load_config

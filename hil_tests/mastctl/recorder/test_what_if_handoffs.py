@@ -20,7 +20,7 @@ from mastctl.cli.main import main
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
-from mastctl.watch.handoffs import read_log
+from mastctl.drift.handoffs import read_log
 
 FELT_PX = 1.2
 RIGHT_PX = 0.6

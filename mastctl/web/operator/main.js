@@ -143,7 +143,7 @@ events.addEventListener("operation", (event) => {
   const going = record.state === "running" ? record.steps.findLast((step) => step.name === "limits") : null;
   head.goal(going ? [going.detail.pan_rad, going.detail.tilt_rad] : undefined);
 });
-events.addEventListener("connected", () => { byId("lost").hidden = true; doubted = !byId("stop-failed").hidden; head.goal(); refresh(); recording.look(); residuals.look(); mastFile.look(); jog.look(); control.again(); });
+events.addEventListener("connected", () => { byId("lost").hidden = true; doubted = !byId("stop-failed").hidden; head.goal(); refresh(); recording.look(); residuals.look(); jog.look(); control.again(); });
 events.addEventListener("lost", () => {
   byId("lost").hidden = false;
   views.turning = false;
@@ -153,6 +153,7 @@ events.addEventListener("lost", () => {
   set(byId("state"), "data-word", "lost");
   document.title = "no connection – mastctl";
 });
+setInterval(() => { if (!document.hidden) refresh(); }, 60000); // the age of a verdict is no event
 setInterval(() => {
   if (!events.connected && events.heardMs) {
     byId("lost").hidden = false;

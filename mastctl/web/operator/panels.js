@@ -157,25 +157,13 @@ export class MastFile {
     this.facts = h("table", { class: "figures" });
     this.said = h("p", { class: "bad", role: "alert" });
     this.drift = h("p", { id: "drift" });
-    setInterval(() => this.look(), 60000);
     put(byId("mast-file"), this.facts, this.drift, h("div", { class: "buttons" }, this.choice, this.use, this.back), this.said);
   }
 
-  /** What the drift sentinel has found. */
-  async look() {
-    if (document.hidden) return;
-    try {
-      const found = await get("/sentinel");
-      const age = found.last_look === null ? "" : found.age_s === null ? " Last look: at an unknown time." : ` Last look ${forTime(found.age_s)} ago.`;
-      this.drift.className = { good: "", bad: "bad", unsure: "warn", none: "quiet" }[found.level];
-      say(this.drift, `Drift sentinel: ${found.sentence}.${age}`);
-    } catch (error) {
-      say(this.drift, `Drift sentinel: ${error.message}`);
-    }
-  }
-
   told(status, rig) {
-    const { mast, former_mast: former, calibration } = status;
+    const { mast, former_mast: former, calibration, sentinel } = status;
+    this.drift.className = { good: "", bad: "bad", unsure: "warn", none: "quiet" }[sentinel.level];
+    say(this.drift, `Drift sentinel: ${sentinel.sentence}.${sentinel.age_s === null ? "" : ` Last look ${forTime(sentinel.age_s)} ago.`}`);
     const verdict = calibration ? { good: "holds", drifts: "drifts", few: "too few pointings yet", unknown: "not known" }[calibration.verdict] : "not known";
     const [made, from] = rig.mast_date ? [String(rig.mast_date), "as the file says"] : rig.modified_s ? [moment(rig.modified_s), "the file's own time; it says no date"] : ["", "no date is known"];
     put(byId("mast"), h("span", { class: "name", title: mast.file }, mast.file), h("span", { class: "verdict" }, h("span", { title: from }, made ? `${rig.mast_date ? "made" : "file of"} ${made.slice(0, 10)}` : "no date"), ", ", h("span", { class: calibration?.verdict ?? "" }, verdict)));

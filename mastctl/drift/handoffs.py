@@ -1,6 +1,6 @@
-"""The mast's self-check in service: the log of hand-offs, and their mean offsets.
+"""The log of hand-offs, from which body cameras are corrected.
 
-Keys of a line of the log: ``schema`` (``mastctl/handoff/1``), ``time`` (ISO 8601, UTC), ``mast_digest``,
+Keys of a line: ``schema`` (``mastctl/handoff/1``), ``time`` (ISO 8601, UTC), ``mast_digest``,
 ``source`` (left and right camera), ``pan_rad``, ``tilt_rad``, ``joint_sigma_rad``, ``left_px``, ``right_px``,
 ``sigma_px`` (of each coordinate of those), ``to_pan_rad``, ``to_tilt_rad``, and ``destinations``, by camera:
 ``geometric_px``, ``geometric_covariance_px2`` (of the clicks), ``verdict``, ``reason``, ``found_px`` and
@@ -11,10 +11,6 @@ joints of the mast file that ``mast_digest`` names.
 from __future__ import annotations
 
 import json
-import logging
-import threading
-from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -28,14 +24,9 @@ from calib.files.mast_file import CameraName
 from calib.files.records import Moment, Number, Pair, Record, Text, problem, read_record
 from calib.files.yaml_text import plain
 from calib.geometry.handoff import Joints
-from calib.matching.handoff import HandoffBias, Landed, MatchedHandoff, RefinedVerdict, handoff_bias
-from drivers.clock import Clock
+from calib.matching.handoff import Landed, MatchedHandoff, RefinedVerdict
 from drivers.recordings.mcap_file import BadRecording, is_mcap, read_messages
-from mastctl.answers import OffsetAnswer, SelfCheck
-from mastctl.control.machine import StandingFault
-from mastctl.watch.journal import Journal, JournalThread
-
-log = logging.getLogger(__name__)
+from mastctl.drift.journal import Journal
 
 SCHEMA = "mastctl/handoff/1"
 TOPIC = "/handoff"
@@ -111,9 +102,9 @@ class ReadLog:
     handoffs: tuple[MatchedHandoff, ...]
 
 
-def handoff_log(path: Path) -> Journal[MatchedHandoff]:
-    """Return the log of hand-offs at a path."""
-    return Journal(path, "hand-offs", line_of, lambda value: handoff_of(path, 0, value), _BEGIN)
+def handoff_log(path: Path) -> Journal[dict[str, Any]]:
+    """Return the log of hand-offs at a path; its records are those of `line_of`."""
+    return Journal(path, "hand-offs", dict, _BEGIN)
 
 
 def line_of(handoff: MatchedHandoff) -> dict[str, Any]:
@@ -135,20 +126,6 @@ def line_of(handoff: MatchedHandoff) -> dict[str, Any]:
         "destinations": {name: vars(one) for name, one in handoff.landed.items()},
     }
     return dict(plain(document))
-
-
-def bias_record(bias: HandoffBias) -> OffsetAnswer:
-    """Return a camera's mean offset as JSON."""
-    return {
-        "source": bias.source,
-        "camera": bias.camera,
-        "handoffs": bias.handoffs,
-        "left_out": bias.left_out,
-        "offset_px": bias.offset_px.tolist(),
-        "sigma_px": np.sqrt(np.diag(bias.covariance_px2)).tolist(),
-        "sigmas": bias.sigmas,
-        "sentence": bias.sentence,
-    }
 
 
 def read_log(path: str | Path) -> ReadLog:
@@ -195,79 +172,3 @@ def handoff_of(path: str | Path, number: int, value: Any) -> MatchedHandoff:
         landed={name: one.landed for name, one in line.destinations.items()},
         name=f"hand-off of {line.time} ({Path(path).name} line {number})",
     )
-
-
-NAME = "handoff_log"
-KEPT = 2000
-"""Newest hand-offs that count."""
-
-
-class HandoffCheck:
-    """The offsets that hand-offs show with the mast file in use; safe from any thread, waits for no file.
-
-    The log at ``path`` is read at the start and appended to; None: earlier hand-offs are not known.
-    """
-
-    def __init__(self, path: Path | None, digest: str, clock: Clock, thread: JournalThread) -> None:
-        self._journal = None if path is None else handoff_log(path)
-        self._clock = clock
-        self._thread = thread
-        self._lock = threading.Lock()
-        self._handoffs: deque[MatchedHandoff] = deque(maxlen=KEPT)
-        self._digest = digest
-        self._judged: tuple[int, tuple[HandoffBias, ...]] = (0, ())  # how many count, the offsets
-        self._fault: StandingFault | None = None
-        if self._journal is not None:
-            thread.put(self._read)
-
-    def add(self, handoff: MatchedHandoff) -> None:
-        """Count a hand-off, and have it logged."""
-        self._judge(lambda: self._handoffs.append(handoff))
-        if self._journal is not None:
-            self._thread.put(lambda: self._write(handoff))
-
-    def use_mast(self, digest: str) -> None:
-        """Count only the hand-offs of this mast file from now on."""
-        self._digest = digest
-        self._judge(lambda: None)
-
-    def summary(self) -> SelfCheck:
-        """Return how many hand-offs of the mast file count, and the significant offsets."""
-        counted, offsets = self._judged
-        return {"handoffs": counted, "offsets": [bias_record(one) for one in offsets]}
-
-    def faults(self) -> tuple[StandingFault, ...]:
-        """Return what is wrong with the log's file."""
-        fault = self._fault
-        return () if fault is None else (fault,)
-
-    def _judge(self, change: Callable[[], None]) -> None:
-        """Change the hand-offs, find their offsets anew, and log those that are new."""
-        with self._lock:
-            change()
-            those = [one for one in self._handoffs if one.mast_digest == self._digest]
-            known = {(one.source, one.camera) for one in self._judged[1]}
-            offsets = tuple(one for one in handoff_bias(those) if one.significant)
-            self._judged = sum(bool(one.found) for one in those), offsets
-        for one in offsets:
-            if (one.source, one.camera) not in known:
-                log.warning("hand-offs show an offset: %s", one.sentence)
-
-    # In the journals' thread
-
-    def _read(self) -> None:
-        assert self._journal is not None
-        earlier = self._journal.earlier()
-
-        def join() -> None:
-            self._handoffs = deque((*earlier, *self._handoffs), maxlen=KEPT)
-
-        self._judge(join)
-
-    def _write(self, handoff: MatchedHandoff) -> None:
-        assert self._journal is not None
-        self._journal.keep(handoff)
-        reason, since_s = self._journal.unwritten, self._fault.since_s if self._fault else self._clock.now_s()
-        self._fault = (
-            StandingFault(NAME, "unwritable", reason, since_s, "a hand-off is logged") if reason else None
-        )

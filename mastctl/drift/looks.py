@@ -1,11 +1,11 @@
-"""Going to the rests of a reference and taking the pictures again, once, or whenever the head is idle."""
+"""Going to the rests of a reference and taking its images again, once, or whenever the head is idle."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,8 +19,8 @@ from calib.files.mast_file import parse_rig
 from calib.geometry.rig import Rig
 from calib.matching.warp import grey
 from mastctl.client import Client, ClientError
+from mastctl.drift.pictures import Reference, ReferencePicture, add_look, read_looks, read_reference
 from mastctl.errors import MastctlError
-from mastctl.watch.sentinel import Reference, ReferencePicture, add_look, read_looks, read_reference
 
 TURN_TIMEOUT_S = 90.0
 EDGE_RAD = 0.05
@@ -120,11 +120,11 @@ def look_again(client: Client, reference: Reference) -> SceneDrift:
     """Take the pictures of a reference again and return what has changed.
 
     Nothing moves before it is known that the reference can be compared with. Raises LookEnded if another mast
-    file or other cameras are in use, or the head is stopped, BadFile for a damaged picture.
+    file or other cameras are in use, or the head is stopped, BadFile for a damaged reference.
     """
     if client.status()["mast"]["digest"] != reference.mast_digest:
         raise LookEnded("another mast file is in use than when the reference was taken; take a new one")
-    reference.check()
+    before = reference.pictures()
     rig, served = head_cameras(client)
     cameras = [name for name in served if name in reference.cameras]
     if not cameras:
@@ -135,16 +135,18 @@ def look_again(client: Client, reference: Reference) -> SceneDrift:
     pictures, missing = take_pictures(client, reference.rests, cameras)
     if any(one.mast_digest != reference.mast_digest for one in pictures):
         raise LookEnded("another mast file came into use during the look; nothing was kept")
-    drift = find_drift(rig, _view_shifts(rig, reference, pictures), JOINT_SIGMA_RAD)
+    drift = find_drift(rig, _view_shifts(rig, before, pictures), JOINT_SIGMA_RAD)
     gone = {name: "not configured any more" for name in reference.cameras if name not in served}
     return replace(drift, missing=gone | missing)
 
 
-def _view_shifts(rig: Rig, reference: Reference, pictures: Sequence[ReferencePicture]) -> list[ViewShift]:
-    """How far the features of a reference have moved in new pictures. Raises BadFile, LookEnded."""
+def _view_shifts(
+    rig: Rig, before: Mapping[tuple[str, int], ReferencePicture], pictures: Sequence[ReferencePicture]
+) -> list[ViewShift]:
+    """How far the features of a reference have moved in new pictures. Raises LookEnded."""
     shifts = []
     for now in pictures:
-        then = reference.picture(now.camera, now.pose)
+        then = before.get((now.camera, now.pose))
         if then is None:
             continue
         model = rig.cameras[now.camera].model
@@ -178,6 +180,25 @@ RETRY_S = 60.0
 NAME = "sentinel"
 
 
+@contextmanager
+def steering(client: Client, lease: str | None = None) -> Iterator[None]:
+    """Steer alone: under a lease that was named, or one of its own, which ends with a stop of the head.
+
+    Raises LookEnded if another client steers, or takes over.
+    """
+    if lease is not None:
+        yield
+        return
+    try:
+        with client.lease(NAME, for_s=LEASE_S, ends_with_stop=True):
+            yield
+    except ClientError as error:
+        if error.code not in ("lease_over", "leased"):
+            raise
+        how = (error.detail or {}).get("how", error)
+        raise LookEnded(f"{how}; nothing was kept") from None
+
+
 def is_due(reference: Reference, last_look: str | None, every_s: float, now: datetime) -> bool:
     """Return whether a look is due: at the reference's time of day, and each ``every_s`` from it on.
 
@@ -192,18 +213,6 @@ def is_due(reference: Reference, last_look: str | None, every_s: float, now: dat
     return turn(now) != turn(datetime.fromisoformat(last).astimezone(UTC))
 
 
-def _look_idle(client: Client, reference: Reference) -> SceneDrift:
-    """Look under a lease, which ends with a stop of the head. Raises LookEnded."""
-    with client.lease(NAME, for_s=LEASE_S, ends_with_stop=True):
-        try:
-            return look_again(client, reference)
-        except ClientError as error:
-            if error.code in ("lease_over", "leased"):
-                how = (error.detail or {}).get("how", error)
-                raise LookEnded(f"{how}; nothing was kept") from None
-            raise
-
-
 def watch(
     folder: Path,
     connect: Callable[[], AbstractContextManager[Client]],
@@ -213,27 +222,28 @@ def watch(
     idle_s: float,
     sleep: Callable[[float], None] = time.sleep,
 ) -> None:
-    """Compare whenever it is due and the head is idle, until interrupted.
+    """Compare every ``every_s`` seconds if the head was not used for ``idle_s``, until interrupted.
 
-    ``put_off`` gets why nothing is done though it is due, each reason once; ``looked`` gets each result. They
-    come every ``every_s`` seconds from the reference's time on, where the head was not used for ``idle_s``.
+    ``put_off`` gets why nothing is done though it is due, each reason once; ``looked`` gets each result.
     Raises BadFile if there is no reference at the start; what fails later is reported, and tried again.
     """
     read_reference(folder)
     reported = ""
     while True:
-        why = ""
+        reason = ""
         try:
             reference = read_reference(folder)
             looks = read_looks(folder, reference)
             if is_due(reference, looks[-1]["time"] if looks else None, every_s, datetime.now(UTC)):
                 with connect() as client:
-                    why = _in_use(client, idle_s)
-                    if not why:
-                        looked(add_look(folder, reference, _look_idle(client, reference)))
+                    reason = _in_use(client, idle_s)
+                    if not reason:
+                        with steering(client):
+                            drift = look_again(client, reference)
+                        looked(add_look(folder, reference, drift))
         except (ClientError, MastctlError, BadFile) as error:
-            why = str(error)
-        if why and why != reported:
-            put_off(f"no look now: {why}")
-        reported = why
+            reason = str(error)
+        if reason and reason != reported:
+            put_off(f"no look now: {reason}")
+        reported = reason
         sleep(min(RETRY_S, every_s / 4.0))

@@ -170,15 +170,15 @@ class Metrics:
         yield _gauge("lease", "1 for what steers: lease, operation.", steers, "kind")
         left_s = None if control is None else control["for_s"]
         yield _gauge("lease_left_seconds", "Until the lease is over.", {(): left_s})
-        if (calibration := status["calibration"]) is not None:
-            drifts = float(calibration["verdict"] == "drifts")
-            drift = "1 if anything says that the mast file does not hold."
-            yield _gauge("calibration_drifts", drift, {(): drifts})
-            judged = float(calibration["pointings"])
-            yield _gauge("calibration_pointings", "Of the last days, that are judged.", {(): judged})
-        if (sentinel := status["sentinel"]) is not None and sentinel["reference"] is not None:
-            bad = float(sentinel["level"] == "bad")
-            yield _gauge("sentinel_drift", "1 if looks found a change.", {(): bad})
+        calibration, sentinel = status["calibration"], status["sentinel"]
+        drifts = {(): float(calibration["verdict"] == "drifts")}
+        yield _gauge("calibration_drifts", "1 if the mast file is not valid any more.", drifts)
+        judged = {(): float(calibration["pointings"])}
+        yield _gauge("calibration_pointings", "Of the last days, that are judged.", judged)
+        if sentinel["reference"] is not None:
+            yield _gauge(
+                "sentinel_drift", "1 if looks found a change.", {(): float(sentinel["level"] == "bad")}
+            )
             yield _gauge("sentinel_look_age_seconds", "Since the last look.", {(): sentinel["age_s"]})
 
 

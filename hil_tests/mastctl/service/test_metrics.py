@@ -12,7 +12,7 @@ from hil_tests.mastctl.service_fakes import fake_result
 from hil_tests.waiting import until
 from mastctl.control.operations import Operation
 from mastctl.control.publisher import Publisher
-from mastctl.watch.metrics import Metrics
+from mastctl.service.metrics import Metrics
 
 STATUS: Any = {
     "state": "ready",
@@ -27,8 +27,8 @@ STATUS: Any = {
         {"device": "navcam_right", "code": "no_reply"},
     ],
     "control": {"holder": "a", "kind": "lease", "for_s": 4.0},
-    "calibration": None,
-    "sentinel": None,
+    "calibration": {"verdict": "few", "pointings": 0},
+    "sentinel": {"reference": None},
 }
 
 DONE = fake_result((6.0, 1.0, 0.0), 6.2, (0.3, -0.1))

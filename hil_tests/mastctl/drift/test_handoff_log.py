@@ -14,7 +14,7 @@ import pytest
 from calib.errors import BadFile
 from calib.geometry.handoff import Joints
 from calib.matching.handoff import Landed, MatchedHandoff
-from mastctl.watch.handoffs import handoff_log, line_of, read_log
+from mastctl.drift.handoffs import handoff_log, line_of, read_log
 
 
 def one(index: int = 0) -> MatchedHandoff:
@@ -33,7 +33,7 @@ def test_what_is_appended_is_read_back_to_the_last_digit(tmp_path: Path) -> None
     path = tmp_path / "new" / "handoffs.jsonl"
     log = handoff_log(path)
     for index in range(3):
-        log.append(one(index))
+        log.append(line_of(one(index)))
     read = read_log(path)
     assert [line_of(handoff) for handoff in read.handoffs] == [line_of(one(i)) for i in range(3)]
     assert read.handoffs[1].name == "hand-off of 2026-01-02T03:04:05.678+00:00 (handoffs.jsonl line 2)"
@@ -44,14 +44,14 @@ def test_what_is_appended_is_read_back_to_the_last_digit(tmp_path: Path) -> None
 def test_a_line_that_a_crash_cut_short_is_passed_over_and_then_taken_away(tmp_path: Path) -> None:
     path = tmp_path / "h.jsonl"
     log = handoff_log(path)
-    log.append(one(0))
+    log.append(line_of(one(0)))
     whole = path.read_bytes()
     path.write_bytes(whole + whole[:100])
     assert len(read_log(path).handoffs) == 1
-    log.append(one(1))
+    log.append(line_of(one(1)))
     assert len(read_log(path).handoffs) == 2
     path.write_bytes(whole.rstrip(b"\n"))  # whole, but for its end: kept
-    log.append(one(1))
+    log.append(line_of(one(1)))
     assert len(read_log(path).handoffs) == 2
 
 
@@ -59,12 +59,12 @@ def test_a_file_of_something_else_is_not_appended_to(tmp_path: Path) -> None:
     path = tmp_path / "mast.yaml"
     path.write_text("schema: mastctl/mast/1\n")
     with pytest.raises(BadFile, match="holds no hand-offs"):
-        handoff_log(path).append(one())
+        handoff_log(path).append(line_of(one()))
     assert path.read_text() == "schema: mastctl/mast/1\n"
     with pytest.raises(BadFile, match="cannot be written"):
-        handoff_log(tmp_path).append(one())
+        handoff_log(tmp_path).append(line_of(one()))
     with pytest.raises(ValueError, match="JSON"):
-        handoff_log(tmp_path / "new.jsonl").append(replace(one(), sigma_px=float("nan")))
+        handoff_log(tmp_path / "new.jsonl").append(line_of(replace(one(), sigma_px=float("nan"))))
     assert not (tmp_path / "new.jsonl").exists()
 
 

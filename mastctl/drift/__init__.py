@@ -1,0 +1,1 @@
+"""Whether the mast file is still valid: residuals, hand-offs, reference images, seams; one verdict."""
