@@ -66,7 +66,7 @@ def test_the_pointing_loop_runs_on_it(hardware: Hardware, mast_file: Path) -> No
         spot_px = (600, 330)
         target = PixelTarget("navcam_left", clicked.frame_id, *spot_px)
         result = point(pixel=target, pointings=2)
-        after = devices.frame_by_id(result["pointings"][-1]["frame_id"])
+        after = devices.store.by_id(result["pointings"][-1]["frame_id"])
     finally:
         devices.close()
     assert [step["name"] for step in steps].count("measure") == 2

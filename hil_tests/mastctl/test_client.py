@@ -23,7 +23,7 @@ BOTH = tuple[RunningDaemon, FakeHardware]
 def test_a_whole_visit(client: Client, pair: BOTH) -> None:
     assert client.status()["state"] == "ready"
     shot = client.snapshot("navcam_left")
-    kept = pair[0].service.devices.frame_by_id(shot.frame_id)
+    kept = pair[0].service.devices.store.by_id(shot.frame_id)
     np.testing.assert_array_equal(shot.image, kept.image)
     assert (shot.pan_rad, shot.mid_exposure_s, shot.moving) == (
         kept.pan_rad,

@@ -18,8 +18,9 @@ from drivers.interfaces import Reading
 from drivers.sim.axis import AxisSettings
 from drivers.sim.heads import PRESETS, HeadModel
 from drivers.sim.pan_tilt import SimulatedPanTilt
-from mastctl.devices.judge import REST_S, KeepOutJudge, Limits
+from mastctl.devices.judge import KeepOutJudge, Limits
 from mastctl.devices.keep_out import Box, KeptOut, Pair, Span
+from mastctl.devices.thread import REST_S
 from mastctl.motion.jog import AHEAD_S, TICK_S
 
 LOOK_S = 0.01

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -18,22 +16,21 @@ from calib.geometry.mode import SensorMode
 from calib.geometry.rig import Rig, RigCamera
 from drivers.absent import AbsentCamera
 from drivers.clock import Clock
-from drivers.errors import BadFrame, BadReply, BadSetting, DriverError, NoFreshFrame
+from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame
 from drivers.frame_times import Offset, Pace, Pairing, learned
-from drivers.interfaces import SETTINGS, Camera, CameraSetting, Frame, FrameTime, Reading
+from drivers.interfaces import Camera, CameraSetting, Frame, FrameTime, Reading
 from mastctl.control.machine import StandingFault
 from mastctl.devices import frames as frame_checks
-from mastctl.devices.frames import KEPT_FRAMES, REQUESTED, FrameStore, StampedFrame, check_known
+from mastctl.devices.frames import FrameStore, StampedFrame, check_known, check_wanted, checked_setting
 from mastctl.devices.joint_history import JointHistory
 from mastctl.devices.thread import Check, DeviceThread, ThreadCall
-from mastctl.errors import NoLonger, NotNow
+from mastctl.errors import NotNow
 
 log = logging.getLogger(__name__)
 
 READINGS_S = 1.0  # for the head's readings to reach beyond an exposure
 SIZE_TIMEOUT_S = 1.0
 CAMERA_GRACE_S = 3.0  # beyond the time given to next_frame: copying and decoding on a busy machine
-WATCHED_SHARE = 0.1  # of real time that watched frames may keep a simulation's clock from going on
 NOT_COMPARED = "%s; the camera is used, and not compared with the mast file in this"
 MOVED_RAD = 1e-5  # a head camera's image that stays the same to the last bit beyond this is frozen
 FAULTS = {
@@ -47,7 +44,7 @@ HOLD_TIMEOUT_S = 3.0  # a driver waits up to 2 s for changes under way to show
 SET_TIMEOUT_S = 2.0
 
 
-class CameraControls:
+class CameraSettings:
     """The settings of all cameras, changed between operations; safe from any thread.
 
     ``cameras`` and ``threads`` may get other entries later. ``clock`` stamps the faults.
@@ -59,8 +56,9 @@ class CameraControls:
         self._cameras = cameras
         self._threads = threads
         self._clock = clock
-        self._holds = Counter[str]()  # of each camera, counted in its own thread
-        self._refocused: Mapping[str, _Refocused] = {}  # replaced, never edited
+        self._fixed = Counter[str]()  # by how many operations, of each camera, counted in its own thread
+        self._focus: Mapping[str, StandingFault] = {}  # replaced, never edited
+        self._calibrated_focus: dict[str, float] = {}  # as it was before its first change
 
     def of(self, name: str) -> tuple[list[CameraSetting], bool]:
         """Return what a camera is set to, and whether an operation keeps it; empty if nothing can change.
@@ -68,7 +66,9 @@ class CameraControls:
         Raises NotKnown; NoReply, BadReply, DriverError if the camera does not answer within 2 s.
         """
         check_known(name, self._cameras)
-        return self._threads[name].call("settings", lambda: self._read(name), SET_TIMEOUT_S, noted=False)
+        return self._threads[name].call(
+            "settings", lambda: (self._read(name), self._fixed[name] > 0), SET_TIMEOUT_S, noted=False
+        )
 
     def change(self, name: str, wanted: Mapping[str, float]) -> list[str]:
         """Change some of a camera's settings; return a sentence for each that became another than wanted.
@@ -79,141 +79,88 @@ class CameraControls:
         check_known(name, self._cameras)
 
         def change() -> list[str]:
-            if self._holds[name]:
+            if self._fixed[name]:
                 why = "an operation compares its pictures and holds its settings; wait for it or stop it"
                 raise NotNow("busy", f"{name}: {why}")
-            before, _ = self._read(name)
+            before = self._read(name)
             changes = check_wanted(before, wanted, name)
             try:
-                notes = [str(note) for note in self._cameras[name].adjust(changes)]
-            except BaseException:
-                with suppress(Exception):  # the first error counts
-                    self._note_focus(name, wanted, before)
-                raise
-            self._note_focus(name, wanted, before)
-            return notes
+                return [str(note) for note in self._cameras[name].adjust(changes)]
+            finally:
+                if "focus" in wanted:
+                    with suppress(Exception):  # the first error counts
+                        self._compare_focus(name, before, self._read(name))
 
         return self._threads[name].call("adjust", change, SET_TIMEOUT_S, noted=False)
 
-    def hold(self, name: str) -> Callable[[], None]:
-        """Keep a camera's exposure and settings as they are; return what ends that.
+    @contextmanager
+    def fixed(self) -> Iterator[None]:
+        """Keep every camera's exposure and settings as they are inside the block.
 
-        Both ends are queued in the camera's own thread, and no caller waits for them. The beginning comes
+        Both ends are queued in each camera's own thread, and no caller waits for them. The beginning comes
         before every image that is taken after it, the end after the beginning, however late that is. So a
         camera that hangs or refuses keeps no operation waiting; its fault says so.
         """
-        stack = ExitStack()
+        stacks = {name: ExitStack() for name in self._threads}
 
-        def enter() -> None:
-            self._holds[name] += 1
-            stack.callback(self._holds.subtract, [name])
-            stack.enter_context(self._cameras[name].exposure_held())
+        def begin(name: str) -> None:
+            self._fixed[name] += 1
+            stacks[name].callback(self._fixed.subtract, [name])
+            stacks[name].enter_context(self._cameras[name].exposure_held())
 
-        def release() -> None:
+        def queue(what: str, name: str, function: Callable[[], None]) -> None:
             with suppress(DriverError):  # closed, and with it the camera
-                self._threads[name].submit("release_exposure", stack.close, HOLD_TIMEOUT_S, anyway=True)
+                self._threads[name].submit(what, function, HOLD_TIMEOUT_S)
 
+        for name in stacks:
+            queue("hold_exposure", name, partial(begin, name))
         try:
-            self._threads[name].submit("hold_exposure", enter, HOLD_TIMEOUT_S)
-        except DriverError:  # overdue or closed: its fault says so already, and it takes no images
-            return lambda: None
-        return release
+            yield
+        finally:
+            for name, stack in stacks.items():
+                queue("release_exposure", name, stack.close)
 
     def calibrated(self) -> None:
         """Treat the focus that each camera has now as that of the mast file, which came into use."""
-        self._refocused = {}
+        self._calibrated_focus, self._focus = {}, {}
 
     def faults(self) -> list[StandingFault]:
         """Return a fault for each camera that has another focus than it was calibrated with."""
-        return [
-            StandingFault(
+        return list(self._focus.values())
+
+    def _read(self, name: str) -> list[CameraSetting]:
+        """In the camera's thread: what it states, if that can be."""
+        return [checked_setting(one, name) for one in self._cameras[name].settings()]
+
+    def _compare_focus(
+        self, name: str, before: Sequence[CameraSetting], after: Sequence[CameraSetting]
+    ) -> None:
+        had, now = (
+            next((one.value for one in some if one.name == "focus"), None) for some in (before, after)
+        )
+        former = self._focus.get(name)
+        self._focus = {key: one for key, one in self._focus.items() if key != name}
+        if had is None or now is None:
+            return
+        calibrated = self._calibrated_focus.setdefault(name, had)
+        if now != calibrated:
+            fault = StandingFault(
                 name,
                 "refocused",
-                f"{name}: its focus is {one.now:g} and was {one.calibrated:g} when the mast file came into "
+                f"{name}: its focus is {now:g} and was {calibrated:g} when the mast file came into "
                 "use; the calibration is not of this focus",
-                one.since_s,
-                f"its focus is {one.calibrated:g} again, or another mast file is in use",
+                self._clock.now_s() if former is None else former.since_s,
+                f"its focus is {calibrated:g} again, or another mast file is in use",
             )
-            for name, one in self._refocused.items()
-        ]
-
-    def _read(self, name: str) -> tuple[list[CameraSetting], bool]:
-        """In the camera's thread: what it states, if that can be."""
-        return [_checked(one, name) for one in self._cameras[name].settings()], self._holds[name] > 0
-
-    def _note_focus(self, name: str, wanted: Mapping[str, float], before: Sequence[CameraSetting]) -> None:
-        """Compare a focus that was to be changed with that of before its first change."""
-        if "focus" not in wanted:
-            return
-        had = next((one.value for one in before if one.name == "focus"), None)
-        now = next((one.value for one in self._read(name)[0] if one.name == "focus"), None)
-        former = self._refocused.get(name)
-        calibrated = former.calibrated if former is not None else had
-        others = {key: one for key, one in self._refocused.items() if key != name}
-        if calibrated is None or now is None or now == calibrated:
-            self._refocused = others
-        else:
-            since_s = self._clock.now_s() if former is None else former.since_s
-            self._refocused = {**others, name: _Refocused(calibrated, now, since_s)}
-
-
-@dataclass(frozen=True)
-class _Refocused:
-    """The focus that a camera was calibrated with, the one that it has, and since when it is not that."""
-
-    calibrated: float
-    now: float
-    since_s: float
-
-
-def _checked(one: object, camera: str) -> CameraSetting:
-    """What a driver states of a setting, its numbers as Python's own. Raises BadReply for what cannot be."""
-    if not isinstance(one, CameraSetting) or one.name not in SETTINGS:
-        name = getattr(one, "name", type(one).__name__)
-        expected = f"where one of {', '.join(SETTINGS)} is expected"
-        raise BadReply(f"settings returned {name!r} {expected}", device=camera)
-    try:
-        low, high, step = map(frame_checks.number, (one.minimum, one.maximum, one.step))
-        value = None if one.value is None else frame_checks.number(one.value)
-        if not (
-            low <= high and step >= 0 and isinstance(one.automatic, bool) and isinstance(one.refusal, str)
-        ):
-            raise ValueError("minimum <= maximum, a step of 0 or more, a truth value and a text are expected")
-    except (TypeError, ValueError) as error:
-        found = f"settings returned {one.name} with {one!r:.300}: {error}"
-        raise BadReply(found, device=camera) from None
-    return replace(one, minimum=low, maximum=high, step=step, value=value)
-
-
-def check_wanted(
-    known: Sequence[CameraSetting], wanted: Mapping[str, float], camera: str
-) -> dict[str, float]:
-    """Return settings that a camera has, can change, and that are within its bounds. Raises BadSetting.
-
-    Bounds are shown with six digits, and one that comes back so is the bound.
-    """
-    has = {one.name: one for one in known}
-    found: dict[str, float] = {}
-    for name, value in wanted.items():
-        if name not in has:
-            known_ones = f"it has {', '.join(has)}" if has else "nothing of it can be changed while it runs"
-            raise BadSetting(f"it has no {name}; {known_ones}", device=camera)
-        one, unit = has[name], SETTINGS[name] and f" {SETTINGS[name]}"
-        if one.refusal:
-            raise BadSetting(f"{name} {one.refusal}", device=camera)
-        low, high = f"{one.minimum:g}", f"{one.maximum:g}"
-        if not min(float(low), one.minimum) <= value <= max(float(high), one.maximum):
-            message = f"{name} is to be {value:g}{unit}, {low} to {high}{unit} is expected"
-            raise BadSetting(message, device=camera)
-        found[name] = min(max(value, one.minimum), one.maximum)
-    return found
+            self._focus = {**self._focus, name: fault}
 
 
 class Cameras:
     """The cameras behind their threads: the part of `mastctl.devices.devices.Devices` that takes images.
 
-    ``sensor_modes`` says which pixels of its sensor each camera's images show, of those that are open and
-    know it. Raises BadFrame if a camera that knows its size, or its sensor's mode, has not the mast file's.
+    ``store`` has the frames that are kept. ``sensor_modes`` says which pixels of its sensor each camera's
+    images show, of those that are open and know it. Raises BadFrame if a camera that knows its size, or its
+    sensor's mode, has not the mast file's.
     """
 
     def __init__(
@@ -230,8 +177,8 @@ class Cameras:
     ) -> None:
         self._cameras = dict(cameras)
         self._threads: dict[str, DeviceThread] = {}
-        self.settings = CameraControls(self._cameras, self._threads, clock)
-        self._store = store
+        self.settings = CameraSettings(self._cameras, self._threads, clock)
+        self.store = store
         self._history = history
         self._read_head = read
         self._head_name = head
@@ -239,13 +186,10 @@ class Cameras:
         self._time = time
         self._grace_s = CAMERA_GRACE_S if grace_s is None else grace_s
         self.sensor_modes: dict[str, SensorMode] = {}
-        self._refused: dict[str, BadFrame] = {}
         self._calibrated: dict[str, RigCamera] = {} if rig is None else dict(rig.cameras)
         self._paired_s: dict[str, float] = {}  # per camera when the last frame that served a set began
         self._learned: dict[tuple[str, str], Offset] = {}
         self._still_since: dict[str, StampedFrame] = {}  # per camera the first frame of the same content
-        self._watching = threading.Lock()
-        self._watch_from_s = 0.0  # of real time
         self._threads.update({name: self._thread_of(name) for name in self._cameras})
         if rig is not None:
             self._check_sizes()
@@ -295,69 +239,19 @@ class Cameras:
         """Return a frame of one camera for those that only watch: it is not published.
 
         Its exposure began after that moment of CLOCK_MONOTONIC, and at most so long ago, seconds. One that an
-        operation took serves. A clock that stands while an image is made is kept from going on for
-        `WATCHED_SHARE` of real time at most. Not for a thread at work on such a clock. Raises as `frames`.
+        operation took serves. Raises as `frames`.
         """
-
-        def watched() -> StampedFrame:
-            after_s = max(exposed_after_s, self._clock.now_s() - max_age_s)
-            newest = self._store.newest(camera)
-            if newest is not None and newest.exposure_began_s > after_s:
-                return newest
-            deadline_s = self._time.now_s() + timeout_s
-            frames = self._fetched({camera: self._known_from(after_s)}, deadline_s)
-            return self._stamped(camera, frames[camera], published=False)
-
-        if not self._clock.stands_for_work:
-            return watched()
-        with self._watching:
-            time.sleep(max(0.0, self._watch_from_s - time.monotonic()))
-            began_s = time.monotonic()
-            try:
-                return watched()
-            finally:
-                ended_s = time.monotonic()
-                self._watch_from_s = ended_s + (ended_s - began_s) * (1.0 / WATCHED_SHARE - 1.0)
-
-    def frame_by_id(self, frame_id: str, max_age_s: float | None = None) -> StampedFrame:
-        """Return a kept frame, not older than so. Raises as `mastctl.devices.frames.FrameStore.by_id`."""
-        frame = self._store.by_id(frame_id)
-        age_s = self._clock.now_s() - frame.mid_exposure_s
-        if max_age_s is not None and age_s > max_age_s:
-            raise NoLonger(
-                "frame_too_old", f"frame {frame_id} is {age_s:.0f} s old, at most {max_age_s:.0f} s is taken"
-            )
-        return frame
-
-    def hold(self, frame: StampedFrame, by: str = REQUESTED, kept: int = KEPT_FRAMES) -> None:
-        """Keep a frame, as `mastctl.devices.frames.FrameStore.hold`."""
-        self._store.hold(frame, by, kept)
-
-    def let_go(self, by: str) -> None:
-        """Keep nothing more for one holder."""
-        self._store.let_go(by)
+        after_s = max(exposed_after_s, self._clock.now_s() - max_age_s)
+        newest = self.store.newest(camera)
+        if newest is not None and newest.exposure_began_s > after_s:
+            return newest
+        deadline_s = self._time.now_s() + timeout_s
+        frames = self._fetched({camera: self._known_from(after_s)}, deadline_s)
+        return self._stamped(camera, frames[camera], published=False)
 
     def newest_frames(self) -> dict[str, StampedFrame | None]:
         """Return each configured camera's newest frame, None where there is none yet; takes no image."""
-        return {camera: self._store.newest(camera) for camera in self._cameras}
-
-    @contextmanager
-    def exposure_held(self) -> Iterator[None]:
-        """Keep every camera's exposure as it is inside the block: a measurement compares its images.
-
-        Nothing is waited for (`CameraControls.hold`).
-        """
-        releases = [self.settings.hold(name) for name in self._threads]
-        try:
-            yield
-        finally:
-            for release in releases:
-                release()
-
-    def camera_faults(self) -> list[StandingFault]:
-        """Return what is wrong with any camera now."""
-        own = [fault for thread in self._threads.values() for fault in thread.faults()]
-        return own + self.settings.faults()
+        return {camera: self.store.newest(camera) for camera in self._cameras}
 
     def frame_counts(self) -> dict[str, tuple[int, int]]:
         """Return how many frames were received and missed, of each camera whose driver counts them."""
@@ -366,48 +260,36 @@ class Cameras:
             name: (one.good, one.damaged + one.dropped) for name, one in counters.items() if one is not None
         }
 
-    def close_cameras(self, until_s: float) -> None:
-        """End the threads; waits until a moment of the deadlines' clock, and for each 0.1 s at least."""
-        for thread in self._threads.values():
-            thread.close(max(0.1, until_s - self._time.now_s()))
-
     # In the cameras' own threads
 
     def _thread_of(self, camera: str) -> DeviceThread:
         """The thread of a camera; that of an absent one opens it when it comes; its absence is a fault."""
-        if not isinstance(self._cameras[camera], AbsentCamera):
-            return DeviceThread(camera, faults=FAULTS, clock=self._time)
-        faults = {**FAULTS, "next_frame": "it is there, or a picture comes"}
-        return DeviceThread(
-            camera,
-            between=lambda: self._join(camera),
-            between_name="next_frame",
-            faults=faults,
-            clock=self._time,
-        )
+        absent = isinstance(self._cameras[camera], AbsentCamera)
+        faults = FAULTS | ({"next_frame": "it is there, or a picture comes"} if absent else {})
+        thread = DeviceThread(camera, faults=faults, clock=self._time)
+        if absent:
+            thread.poll("next_frame", partial(self._join, camera), 1.0)
+        return thread
 
     def _join(self, name: str) -> None:
         """Put a camera that was absent at the start in its place, if it is there. Raises DriverError."""
         place = self._cameras[name]
         if isinstance(place, AbsentCamera):
-            self._cameras[name] = place.appeared()
-            log.warning("%s is here", name)
-        try:
-            self._check_as_calibrated(name)
-        except BadFrame as refused:
-            self._refused[name] = refused
-            raise
-        except Exception as error:
-            if name in self._refused:  # until it is seen to be right
-                raise
-            log.warning(NOT_COMPARED, error if isinstance(error, DriverError) else f"{name}: {error!r}")
-        self._refused.pop(name, None)
+            camera = place.appeared()
+            self._check_as_calibrated(name, camera)
+            self._cameras[name] = camera
+            log.warning("%s is present", name)
 
     def _check_sizes(self) -> None:
         """Pass cameras that are as calibrated, or do not answer now. Raises BadFrame."""
         until_s = self._time.now_s() + SIZE_TIMEOUT_S
         calls = {
-            name: thread.submit("info", partial(self._check_as_calibrated, name), SIZE_TIMEOUT_S, noted=False)
+            name: thread.submit(
+                "info",
+                partial(self._check_as_calibrated, name, self._cameras[name]),
+                SIZE_TIMEOUT_S,
+                noted=False,
+            )
             for name, thread in self._threads.items()
         }
         for name, call in calls.items():
@@ -420,12 +302,12 @@ class Cameras:
             except DriverError as error:
                 log.warning(NOT_COMPARED, error)
 
-    def _check_as_calibrated(self, name: str) -> None:
+    def _check_as_calibrated(self, name: str, camera: Camera) -> None:
         """Pass a camera whose sensor mode and size, as far as it knows them, are the mast file's.
 
         Raises BadFrame if one is not, and what its driver raises.
         """
-        info, calibrated = self._cameras[name].info, self._calibrated.get(name)
+        info, calibrated = camera.info, self._calibrated.get(name)
         mode, then = info.sensor_mode, None if calibrated is None else calibrated.sensor_mode
         # The mode first: its refusal says better than that of the size what would mend it.
         if isinstance(mode, SensorMode):
@@ -452,11 +334,10 @@ class Cameras:
         return Pace(float(info.period_s), str(info.trigger), recent)
 
     def _take(self, camera: str, exposed_after_s: float, deadline_s: float) -> Frame | StampedFrame:
-        newest = self._store.newest(camera)
+        newest = self.store.newest(camera)
         if newest is not None and newest.exposure_began_s > exposed_after_s:
             return newest  # another request brought it a moment ago
-        if camera in self._refused:
-            raise BadFrame(str(self._refused[camera]))
+        self._join(camera)
         left_s = max(0.0, deadline_s - self._time.now_s())
         answer = self._cameras[camera].next_frame(exposed_after_s, left_s)
         known = self._calibrated.get(camera)
@@ -464,9 +345,9 @@ class Cameras:
         frame = frame_checks.checked(answer, camera, size_px, exposed_after_s, self._clock.now_s())
         if newest is not None:
             try:
-                _check_order(frame, newest)
+                frame_checks.check_order(frame, newest)
             except BadFrame:  # refused once; a camera that came back counting from 0 goes on after that
-                self._store.begin_again(camera)
+                self.store.begin_again(camera)
                 raise
         return frame
 
@@ -526,7 +407,7 @@ class Cameras:
         """Give a frame its joint angles and id, and keep it."""
         if isinstance(frame, StampedFrame):
             if published:
-                self._store.publish(frame)  # until now it was only watched
+                self.store.publish(frame)  # until now it was only watched
             return frame
         began_s = frame.mid_exposure_s - frame.exposure_s / 2
         ended_s = frame.mid_exposure_s + frame.exposure_s / 2
@@ -535,7 +416,7 @@ class Cameras:
             if self._read_head().time_s < ended_s and self._time.now_s() > until_s:
                 raise BadReply("the readings stay behind the frame's exposure", device=self._head_name)
         joints = self._history.at_exposure(began_s, frame.mid_exposure_s, ended_s, self._head_name)
-        frame_id, mast_digest = self._store.name(camera, frame.sequence)
+        frame_id, mast_digest = self.store.name(camera, frame.sequence)
         stamped = StampedFrame(
             frame_id=frame_id,
             camera=camera,
@@ -554,7 +435,11 @@ class Cameras:
             tilt_approach=joints.approach[1],
             settings=frame.settings,
         )
-        return self._store.add(stamped, published, self._check_alive)
+        self._check_alive(stamped)
+        kept = self.store.add(stamped)
+        if published:
+            self.store.publish(kept)
+        return kept
 
     def _check_alive(self, frame: StampedFrame) -> None:
         """Refuse a head camera's image that did not change at all while the head moved."""
@@ -569,15 +454,3 @@ class Cameras:
                 f"the picture is frozen: equal to the last bit although the head moved {moved_rad:.6f} rad",
                 device=frame.camera,
             )
-
-
-def _check_order(frame: Frame, newest: StampedFrame) -> None:
-    """Refuse a frame whose count and time do not go forward together."""
-    ahead = frame.sequence - newest.sequence
-    later_s = frame.mid_exposure_s - newest.mid_exposure_s
-    if (ahead > 0) != (later_s > 0) or (ahead < 0) != (later_s < 0) or ahead < 0:
-        raise BadFrame(
-            f"frame {frame.sequence} is {later_s:.3f} s after frame {newest.sequence}: "
-            "count and time must grow together",
-            device=newest.camera,
-        )

@@ -16,17 +16,17 @@ from typing import Protocol
 
 from calib.geometry.rig import JointErrors, Rig
 from drivers.clock import Clock, deadlines_on
-from drivers.errors import BadReply, DriverError, LineLost, NoReply
+from drivers.errors import BadReply, DriverError, NoReply
 from drivers.interfaces import COARSE_COUNT_RAD, AxisReport, Camera, PanTilt
 from drivers.options import is_number
 from mastctl.control.machine import StandingFault, StateMachine, same_faults
 from mastctl.devices import joint_history
 from mastctl.devices.cameras import Cameras
-from mastctl.devices.frames import FrameStore, StampedFrame
+from mastctl.devices.frames import FrameStore, StampedFrame, random_run
 from mastctl.devices.joint_history import HeadReading, JointHistory
-from mastctl.devices.judge import REST_S, KeepOutJudge, Limits, SunDirection
+from mastctl.devices.judge import KeepOutJudge, Limits, SunDirection
 from mastctl.devices.keep_out import Pair
-from mastctl.devices.thread import AT_ONCE_S, PATIENCE_S, DeviceThread, StopRequests
+from mastctl.devices.thread import AT_ONCE_S, PATIENCE_S, DeviceThread, HeadThread
 from mastctl.errors import MastctlError, Stopped
 
 log = logging.getLogger(__name__)
@@ -95,7 +95,7 @@ class Devices(Cameras):
         clock: Clock,
         rig: Rig | None = None,
         camera_grace_s: float | None = None,
-        new_run: Callable[[], str] | None = None,
+        new_run: Callable[[], str] = random_run,
         sun: SunDirection | None = None,
         machine: StateMachine | None = None,
     ) -> None:
@@ -109,31 +109,26 @@ class Devices(Cameras):
         self._joints = JointErrors() if rig is None else rig.joints
         history = JointHistory(self._joints)
         store = FrameStore(mast_digest, new_run=new_run, on_new=self._new_frame)
-        self._gate = threading.Lock()
-        self._blocks: dict[object, str] = {}  # why no move is let out, by holder
+        self._blocks: dict[object, str] = {}  # why no move is let out, by who blocks it
         self._closed = False
         self.reports: Mapping[str, AxisReport] = {}
         self._reported_s: Mapping[str, float] = {}  # what the head reports about itself, and since when
-        # The last move's ticket and when it was taken, until the head was read at rest after it.
-        self._moved: tuple[int, float] | None = None
-        self._stop_lost = False  # a lost line kept a stop from the head, which was not read at rest since
         super().__init__(
             hardware.cameras, store, history, self.read, HEAD, clock, deadlines, rig, camera_grace_s
         )
-        self._head = DeviceThread(
+        self._head = HeadThread(
             HEAD,
-            between=self._poll,
-            between_timeout_s=READ_TIMEOUT_S,
-            faults=FAULTS,
-            moves="move",
-            clock=deadlines,
+            lambda: self._pan_tilt.stop(),
+            AT_ONCE_S if self._pan_tilt.info.stops_beside is True else PATIENCE_S,
+            deadlines,
+            FAULTS,
         )
-        patience_s = AT_ONCE_S if self._pan_tilt.info.stops_beside is True else PATIENCE_S
-        self._stops = StopRequests(self._head, HEAD, lambda: self._pan_tilt.stop(), deadlines, patience_s)
+        self._head.poll("read", self._poll, READ_TIMEOUT_S)
         self._sources: tuple[Callable[[], Sequence[StandingFault]], ...] = (self._faults,)
         self._published: dict[str, tuple[StandingFault, ...]] = {}  # faults by device
         self._comparing = threading.Lock()
-        self._watch = DeviceThread("faults", between=self.check_faults, between_name="check", clock=deadlines)
+        self._watch = DeviceThread("faults", clock=deadlines)
+        self._watch.poll("check", self.check_faults, 1.0)
 
     @property
     def last_reading(self) -> HeadReading | None:
@@ -157,13 +152,8 @@ class Devices(Cameras):
     @property
     def reading_sigma_rad(self) -> Pair:
         """What a reading of pan and tilt may be off by, one sigma: that of a count, 12-bit if not stated."""
-        pan, tilt = (self.counts_rad.get(axis, COARSE_COUNT_RAD) for axis in ("pan", "tilt"))
+        pan, tilt = (self.judge.counts_rad.get(axis, COARSE_COUNT_RAD) for axis in ("pan", "tilt"))
         return pan / math.sqrt(12.0), tilt / math.sqrt(12.0)
-
-    @property
-    def counts_rad(self) -> Mapping[str, float]:
-        """One count of ``pan`` and of ``tilt``, as far as the head says it."""
-        return self.judge.counts_rad
 
     def goal(self, true_rad: Pair, start: HeadReading) -> Pair:
         """Return the readings to send a head to that rests at ``start``, so that it comes to true angles.
@@ -192,17 +182,16 @@ class Devices(Cameras):
         back from the driver yet; nothing was sent then. Raises NoReply, DriverError if the head does not take
         the command in 1 s.
         """
-        ticket = self._stops.ticket()
+        ticket = self._head.ticket()
         goal = float(pan_rad), float(tilt_rad)
 
         def check_free() -> None:
             refusal = self.latched()
             if refusal is not None:
                 raise refusal
-            with self._gate:
-                if self._blocks:
-                    raise Stopped(next(iter(self._blocks.values())))
-            self._stops.check(ticket)
+            if reasons := tuple(self._blocks.values()):
+                raise Stopped(reasons[0])
+            self._head.check(ticket)
 
         def send() -> None:
             check_free()
@@ -213,13 +202,9 @@ class Devices(Cameras):
             self._history.move_sent(self._clock.now_s())
             self.judge.sent(start, goal, speed)
             self._pan_tilt.move(*goal, speed)
-            self._moved = ticket, self._time.now_s()
+            self._head.moved(ticket)
 
         self._head.call("move", send, MOVE_TIMEOUT_S)
-
-    def check_from(self, start: Pair, goal: Pair) -> None:
-        """Pass a goal that may be commanded from a place (`KeepOutJudge.check_from`)."""
-        self.judge.check_from(start, goal)
 
     def stop(self) -> None:
         """Halt the head at once, whatever hangs; moves still waiting are never sent.
@@ -227,9 +212,8 @@ class Devices(Cameras):
         Raises NoReply, DriverError if the head did not confirm within 1 s; it may still move.
         """
         try:
-            self._stops.send(STOP_TIMEOUT_S)
-        except BaseException as error:
-            self._stop_lost |= isinstance(error, LineLost)
+            self._head.stop(STOP_TIMEOUT_S)
+        except BaseException:
             self.check_faults()  # the fault is published before the stop is over
             raise
         if self._machine.standing.faults:
@@ -237,17 +221,15 @@ class Devices(Cameras):
 
     def stops_returned(self, timeout_s: float) -> bool:
         """Return whether every stop has come back from the driver within ``timeout_s`` seconds."""
-        return self._stops.returned(timeout_s)
+        return self._head.stops_returned(timeout_s)
 
-    def block_moves(self, holder: object, reason: str) -> None:
-        """Refuse every further move until the holder (any key) allows them again."""
-        with self._gate:
-            self._blocks[holder] = reason
+    def block_moves(self, by: object, reason: str) -> None:
+        """Refuse every further move until ``by``, any key, allows them again."""
+        self._blocks[by] = reason
 
-    def allow_moves(self, holder: object) -> None:
-        """Take back what this holder blocked; moves go out when none is left."""
-        with self._gate:
-            self._blocks.pop(holder, None)
+    def allow_moves(self, by: object) -> None:
+        """Take back what was blocked by a key; moves go out when nothing blocks them."""
+        self._blocks.pop(by, None)
 
     def use_rig(self, rig: Rig, mast_digest: str) -> None:
         """Stamp frames with another mast file from now on, and forget those that were stamped before."""
@@ -256,7 +238,7 @@ class Devices(Cameras):
         self._joints = rig.joints
         self._history.use_joints(rig.joints)
         self.judge.use_rig(rig)
-        self._store.change_mast(mast_digest)
+        self.store.change_mast(mast_digest)
 
     def watch_faults(self, source: Callable[[], Sequence[StandingFault]]) -> None:
         """Have another source's faults published too: the daemon's own files. It must not wait."""
@@ -294,7 +276,8 @@ class Devices(Cameras):
             for fault, since_s in self._reported_s.items()
         ]
         judged = self.judge.faults(self._history.newest)
-        return (*self._head.faults(), *self._stops.faults(), *reported, *judged, *self.camera_faults())
+        cameras = (fault for thread in self._threads.values() for fault in thread.faults())
+        return (*self._head.faults(), *reported, *judged, *cameras, *self.settings.faults())
 
     def errors(self) -> dict[tuple[str, str, str], int]:
         """Return how often calls have failed since the start: by device, call, and the error's code."""
@@ -304,17 +287,17 @@ class Devices(Cameras):
     def close(self) -> None:
         """Stop the head and end the threads; takes some 4 s at most and never raises."""
         self.block_moves(self, "the service is closing")
-        with self._gate:
-            if self._closed:
-                return
-            self._closed = True
+        if self._closed:
+            return
+        self._closed = True
         try:
             self.stop()
         except (DriverError, MastctlError) as error:
             log.error("the head did not confirm the last stop: %s", error)
         until_s = self._time.now_s() + CLOSE_S
         self._head.close(CLOSE_S)
-        self.close_cameras(until_s)
+        for thread in self._threads.values():
+            thread.close(max(0.1, until_s - self._time.now_s()))
         self.check_faults()
         self._watch.close(CLOSE_S)
 
@@ -341,12 +324,7 @@ class Devices(Cameras):
             self._reported_s = {fault: before_s.get(fault, reading.time_s) for fault in reading.faults}
             log.warning("%s reports: %s", HEAD, "; ".join(reading.faults) or "healthy again")
         if not reading.moving:
-            if self._stop_lost:
-                self._stop_lost = False
-                self._stops.rests()
-            if self._moved is not None and self._time.now_s() - self._moved[1] > REST_S:
-                ticket, self._moved = self._moved[0], None
-                self._stops.proved(ticket)
+            self._head.rests()
         self._machine.head_read(reading.moving)
         self._publisher.publish("joints", HEAD, reading)
         return reading

@@ -11,22 +11,24 @@ import re
 import secrets
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
 from calib.geometry.mode import BadMode, SensorMode, flip_name, mode_between
-from drivers.errors import BadFrame, NoFreshFrame
-from drivers.interfaces import SETTINGS, Frame, Image
+from drivers.errors import BadFrame, BadReply, BadSetting, NoFreshFrame
+from drivers.interfaces import SETTINGS, CameraSetting, Frame, Image
 from mastctl.errors import NoLonger, NotKnown, NotNow
 from mastctl.frame_facts import FrameFacts
 
 _FRAME_ID = re.compile(r"(.{1,100})-([0-9]{6,20})-([0-9a-f]{8})-([0-9a-f]{4})", re.ASCII)
 KEPT_FRAMES = 16  # per camera; six cameras of 1024x768 grey are 75 MB
-REQUESTED = "requested"  # the holder of frames that were given by name: to a snapshot, a click
-OPERATIONS = "operations"  # the holder of the images that pointings end with
-WATCHED_BYTES = 256_000_000  # of the frames of all other holders, which only watch, each frame counted once
+NEWEST = "newest"  # the keeper of each camera's last frames
+REQUESTED = "requested"  # of frames that were given by name: to a snapshot, a click
+OPERATIONS = "operations"  # of the images that pointings end with
+NOT_WATCHING = (NEWEST, REQUESTED, OPERATIONS)
+WATCHED_BYTES = 256_000_000  # of the frames of all other keepers
 MOST_PUBLISHED = 1024  # more than are kept of all cameras
 CLOCK_TOLERANCE_S = 0.005  # what a stamp may lie in the future: rounding, and a driver that estimates
 DARK_GREY = 8  # an image whose brightest hundredth is below this shows nothing to correlate with
@@ -149,75 +151,85 @@ def checked(
     return Frame(image, sequence, mid_s, exposure_s, jpeg=jpeg, settings=_settings(answer))
 
 
+def checked_setting(one: object, camera: str) -> CameraSetting:
+    """Return what a driver states of a setting, its numbers as Python's own. Raises BadReply."""
+    if not isinstance(one, CameraSetting) or one.name not in SETTINGS:
+        name = getattr(one, "name", type(one).__name__)
+        expected = f"where one of {', '.join(SETTINGS)} is expected"
+        raise BadReply(f"settings returned {name!r} {expected}", device=camera)
+    try:
+        low, high, step = map(number, (one.minimum, one.maximum, one.step))
+        value = None if one.value is None else number(one.value)
+        if not (
+            low <= high and step >= 0 and isinstance(one.automatic, bool) and isinstance(one.refusal, str)
+        ):
+            raise ValueError("minimum <= maximum, a step of 0 or more, a truth value and a text are expected")
+    except (TypeError, ValueError) as error:
+        found = f"settings returned {one.name} with {one!r:.300}: {error}"
+        raise BadReply(found, device=camera) from None
+    return replace(one, minimum=low, maximum=high, step=step, value=value)
+
+
+def check_wanted(
+    known: Sequence[CameraSetting], wanted: Mapping[str, float], camera: str
+) -> dict[str, float]:
+    """Return settings that a camera has, can change, and that are within its bounds. Raises BadSetting.
+
+    Bounds are shown with six digits, and one that comes back so is the bound.
+    """
+    has = {one.name: one for one in known}
+    found: dict[str, float] = {}
+    for name, value in wanted.items():
+        if name not in has:
+            known_ones = f"it has {', '.join(has)}" if has else "nothing of it can be changed while it runs"
+            raise BadSetting(f"it has no {name}; {known_ones}", device=camera)
+        one, unit = has[name], SETTINGS[name] and f" {SETTINGS[name]}"
+        if one.refusal:
+            raise BadSetting(f"{name} {one.refusal}", device=camera)
+        low, high = f"{one.minimum:g}", f"{one.maximum:g}"
+        if not min(float(low), one.minimum) <= value <= max(float(high), one.maximum):
+            message = f"{name} is to be {value:g}{unit}, {low} to {high}{unit} is expected"
+            raise BadSetting(message, device=camera)
+        found[name] = min(max(value, one.minimum), one.maximum)
+    return found
+
+
+def check_order(frame: Frame, newest: StampedFrame) -> None:
+    """Refuse a frame whose count and time do not go forward together."""
+    ahead = frame.sequence - newest.sequence
+    later_s = frame.mid_exposure_s - newest.mid_exposure_s
+    if (ahead > 0) != (later_s > 0) or (ahead < 0) != (later_s < 0) or ahead < 0:
+        raise BadFrame(
+            f"frame {frame.sequence} is {later_s:.3f} s after frame {newest.sequence}: "
+            "count and time must grow together",
+            device=newest.camera,
+        )
+
+
 def random_run() -> str:
     """Return four hexadecimal digits that tell a run from those before it."""
     return secrets.token_hex(2)
 
 
-class _Kept:
-    """The frames that holders keep, the newest of each camera, by (holder, camera).
-
-    Of holders that only watch the oldest give way beyond ``WATCHED_BYTES`` in all, each frame counted once.
-    """
-
-    def __init__(self) -> None:
-        self._frames: dict[tuple[str, str], dict[str, StampedFrame]] = {}
-        self._watched: dict[tuple[tuple[str, str], str], int] = {}  # bytes of (place, frame), oldest first
-
-    def add(self, by: str, frame: StampedFrame, most: int) -> None:
-        """Keep a frame as the newest of its camera, of which a holder has so many."""
-        place, name = (by, frame.camera), frame.frame_id
-        self._remove(place, name)
-        frames = self._frames.setdefault(place, {})
-        frames[name] = frame
-        if by not in (REQUESTED, OPERATIONS):
-            self._watched[place, name] = frame.image.nbytes
-        while len(frames) > most:
-            self._remove(place, next(iter(frames)))
-        while len(self._watched) > 1 and self._bytes() > WATCHED_BYTES:
-            self._remove(*next(iter(self._watched)))
-
-    def get(self, frame_id: str) -> StampedFrame | None:
-        """Return a kept frame by its id."""
-        return next((frames[frame_id] for frames in self._frames.values() if frame_id in frames), None)
-
-    def drop(self, by: str | None = None, camera: str | None = None) -> None:
-        """Keep nothing more for a holder, or of a camera."""
-        for place in [one for one in self._frames if by == one[0] or camera == one[1]]:
-            for frame_id in list(self._frames[place]):
-                self._remove(place, frame_id)
-
-    def _remove(self, place: tuple[str, str], frame_id: str) -> None:
-        self._watched.pop((place, frame_id), None)
-        frames = self._frames.get(place, {})
-        frames.pop(frame_id, None)
-        if not frames:
-            self._frames.pop(place, None)
-
-    def _bytes(self) -> int:
-        return sum({name: size for (_, name), size in self._watched.items()}.values())
-
-
 class FrameStore:
-    """The newest frames of each camera, found again by id. Safe to use from any thread.
+    """The newest frames of each camera, and those that are kept longer, by id. Safe to use from any thread.
 
-    ``new_run`` makes the last part of ids, four hexadecimal digits; `random_run` by default. ``on_new`` gets
-    each frame that is published, once; must return at once.
+    ``new_run`` makes the last part of ids, four hexadecimal digits. ``on_new`` gets each frame that is
+    published, once; must return at once.
     """
 
     def __init__(
         self,
         mast_digest: str,
-        new_run: Callable[[], str] | None = None,
+        new_run: Callable[[], str] = random_run,
         on_new: Callable[[StampedFrame], None] = lambda frame: None,
     ) -> None:
         self._digest = mast_digest
         self._on_new = on_new
-        self._new_run = new_run or random_run
+        self._new_run = new_run
         self._runs: dict[str, str] = {}
-        self._frames: dict[str, deque[StampedFrame]] = {}
-        self._kept = _Kept()
-        self._newest: Mapping[str, StampedFrame] = {}  # replaced, never edited
+        self._kept: dict[tuple[str, str], dict[str, StampedFrame]] = {}  # by (keeper, camera), oldest first
+        self._newest: Mapping[str, StampedFrame] = {}  # replaced, never edited: read without a lock
         self._published: deque[str] = deque(maxlen=MOST_PUBLISHED)
         self._lock = threading.Lock()
 
@@ -236,73 +248,59 @@ class FrameStore:
         """
         with self._lock:
             self._digest = mast_digest
-            self._frames.clear()
-            self._kept = _Kept()
+            self._kept.clear()
             self._newest = {}
             self._runs.clear()
 
     def begin_again(self, camera: str) -> None:
         """Forget a camera's frames, because its count went back: one number must not name two images."""
         with self._lock:
-            self._frames.pop(camera, None)
-            self._kept.drop(camera=camera)
+            self._kept = {place: frames for place, frames in self._kept.items() if place[1] != camera}
             self._newest = {name: frame for name, frame in self._newest.items() if name != camera}
             self._runs[camera] = self._new_run()
 
-    def add(
-        self,
-        frame: StampedFrame,
-        published: bool = True,
-        check: Callable[[StampedFrame], None] = lambda frame: None,
-    ) -> StampedFrame:
-        """Keep a frame that passes a ``check`` and return it, or the one of that id that is kept already.
-
-        One that is only watched is not ``published``, and so not recorded.
-        """
+    def add(self, frame: StampedFrame) -> StampedFrame:
+        """Keep a frame as its camera's newest; return it, or the one of that id that is kept already."""
         with self._lock:
-            check(frame)
-            if frame.mast_digest == self._digest:  # else the mast file changed while it was on its way
-                frames = self._frames.setdefault(frame.camera, deque(maxlen=KEPT_FRAMES))
-                known = next((one for one in frames if one.frame_id == frame.frame_id), None)
-                if known is None:
-                    frames.append(frame)
-                    self._newest = {**self._newest, frame.camera: frame}
-                frame = known or frame
-        if published:
-            self.publish(frame)
-        return frame
+            known = self._kept.get((NEWEST, frame.camera), {}).get(frame.frame_id)
+            if known is None and self._put(frame, NEWEST, KEPT_FRAMES):
+                self._newest = {**self._newest, frame.camera: frame}
+            return known or frame
 
     def publish(self, frame: StampedFrame) -> None:
         """Publish a frame that is used, unless it was, and keep it as one that was requested."""
         with self._lock:
-            if frame.mast_digest != self._digest:
-                return
-            self._kept.add(REQUESTED, frame, KEPT_FRAMES)
-            if frame.frame_id in self._published:
+            if not self._put(frame, REQUESTED, KEPT_FRAMES) or frame.frame_id in self._published:
                 return
             self._published.append(frame.frame_id)
         self._on_new(frame)
 
+    def keep(self, frame: StampedFrame, keeper: str, most: int) -> None:
+        """Keep a frame for a keeper, however many come after it: it may be clicked yet.
+
+        Each has the newest that it was given of every camera, ``most`` at most. Of all keepers that only
+        watch the oldest give way beyond `WATCHED_BYTES`, each frame counted once.
+        """
+        with self._lock:
+            self._put(frame, keeper, most)
+            watching = [frames for (one, _), frames in self._kept.items() if one not in NOT_WATCHING]
+            watched = {one.frame_id: one for frames in watching for one in frames.values()}
+            excess = sum(one.image.nbytes for one in watched.values()) - WATCHED_BYTES
+            for one in sorted(watched.values(), key=lambda one: one.mid_exposure_s):
+                if excess <= 0:
+                    break
+                excess -= one.image.nbytes
+                for frames in watching:
+                    frames.pop(one.frame_id, None)
+
+    def release(self, keeper: str) -> None:
+        """Keep nothing more for a keeper."""
+        with self._lock:
+            self._kept = {place: frames for place, frames in self._kept.items() if place[0] != keeper}
+
     def newest(self, camera: str) -> StampedFrame | None:
         """Return a camera's newest frame, None before the first; takes no lock."""
         return self._newest.get(camera)
-
-    def hold(self, frame: StampedFrame, by: str = REQUESTED, kept: int = KEPT_FRAMES) -> None:
-        """Keep a frame for a holder, however many come after it: it may be clicked yet.
-
-        Each holder keeps the newest it was given of every camera, ``kept`` at most.
-        """
-        if by == REQUESTED:
-            self.publish(frame)
-            return
-        with self._lock:
-            if frame.mast_digest == self._digest:
-                self._kept.add(by, frame, kept)
-
-    def let_go(self, by: str) -> None:
-        """Keep nothing more for a holder."""
-        with self._lock:
-            self._kept.drop(by=by)
 
     def by_id(self, frame_id: str) -> StampedFrame:
         """Return a frame by its id.
@@ -310,30 +308,38 @@ class FrameStore:
         Raises NoLonger, NotNow, NotKnown ``frame_too_old`` if it was taken in this run but is no longer kept,
         ``other_mast_file`` if it was taken with another mast file, ``frame_unknown`` otherwise.
         """
-        with self._lock:
-            for frames in self._frames.values():
-                for frame in frames:
-                    if frame.frame_id == frame_id:
-                        return frame
-            if (kept := self._kept.get(frame_id)) is not None:
-                return kept
-            newest = {camera: frames[-1].sequence for camera, frames in self._frames.items() if frames}
-            runs = dict(self._runs)
-            in_use = self._digest[:8]
         named = _FRAME_ID.fullmatch(frame_id)
+        with self._lock:
+            for frames in self._kept.values():
+                if frame_id in frames:
+                    return frames[frame_id]
+            in_use = self._digest[:8]
+            known_run = named is not None and self._runs.get(named[1]) == named[4]
         if named is not None:
-            camera, sequence, mast, run = named.groups()
+            camera, sequence, mast, _ = named.groups()
             if mast != in_use:
                 raise NotNow(
                     "other_mast_file",
                     f"frame {frame_id} was taken with mast file {mast}..., the one in use is {in_use}...",
                 )
-            if run == runs.get(camera) and int(sequence) <= newest.get(camera, -1):
+            newest = self.newest(camera)
+            if known_run and newest is not None and int(sequence) <= newest.sequence:
                 raise NoLonger(
                     "frame_too_old",
                     f"frame {frame_id} is no longer kept (the newest {KEPT_FRAMES} of a camera are)",
                 )
         raise NotKnown("frame_unknown", f"frame {frame_id[:120]} was not taken by this run of the service")
+
+    def _put(self, frame: StampedFrame, keeper: str, most: int) -> bool:
+        """Keep a frame, the lock is held; False if the mast file changed while it was on its way."""
+        if frame.mast_digest != self._digest:
+            return False
+        frames = self._kept.setdefault((keeper, frame.camera), {})
+        frames.pop(frame.frame_id, None)
+        frames[frame.frame_id] = frame
+        while len(frames) > most:
+            del frames[next(iter(frames))]
+        return True
 
 
 def camera_and_sequence(frame_id: str) -> tuple[str, int]:

@@ -24,11 +24,11 @@ from drivers.interfaces import AxisMotion, PanTilt, Reading
 from mastctl.answers import SunAnswer
 from mastctl.control.machine import StandingFault
 from mastctl.devices.keep_out import Box, KeepOuts, Pair, Span
+from mastctl.devices.thread import REST_S
 from mastctl.errors import BadRequest
 
 log = logging.getLogger(__name__)
 
-REST_S = 0.3  # after a move was taken, before a reading that says rest is one of its end
 TRAVEL_S = 0.1  # from a reading to the moment when the next command acts on the axes
 ASSUMED_RAD_PER_S2 = 0.4  # of a head that does not say how it brakes: the least that a driver can be set to
 PARTS = 16  # in which a goal ahead is tried

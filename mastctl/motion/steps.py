@@ -195,7 +195,7 @@ class Steps:
         refused: KeptOut | None = None
         for one in ordered(solutions, self._limits.pan_rad, self._limits.tilt_rad, *at, goal):
             try:
-                self._devices.check_from(at, goal(one))
+                self._devices.judge.check_from(at, goal(one))
             except KeptOut as error:
                 refused = refused or error
             else:
@@ -223,7 +223,7 @@ class Steps:
             self.send(pan_rad, tilt_rad)
         with self.step("settle") as detail:
             settled = self.arrived(pan_rad, tilt_rad, began_s + allowed_s)
-            detail.update(_angles(settled), count_rad=dict(self._devices.counts_rad))
+            detail.update(_angles(settled), count_rad=dict(self._devices.judge.counts_rad))
             if reports := self._devices.reports:
                 detail.update(counts={name: _counts(axis) for name, axis in reports.items()})
         return settled
@@ -231,7 +231,7 @@ class Steps:
     def check_goal(self, pan_rad: float, tilt_rad: float) -> None:
         """Pass angles to which the head may be sent from where it rests. Raises OutsideLimits, KeptOut."""
         now = self.read()
-        self._devices.check_from((now.pan_rad, now.tilt_rad), (pan_rad, tilt_rad))
+        self._devices.judge.check_from((now.pan_rad, now.tilt_rad), (pan_rad, tilt_rad))
 
     def time_allowed_s(self, pan_rad: float, tilt_rad: float) -> float:
         """Return the deadline of a move to these angles: distance over speed, ramps, dwell, margin."""
@@ -288,7 +288,7 @@ class Steps:
 
         Raises MastctlError, DriverError, as `clicked_frame` too.
         """
-        view = self.cameras.view(clicked_frame(target, self._rig, self._devices.frame_by_id))
+        view = self.cameras.view(clicked_frame(target, self._rig, self._devices.store.by_id))
         pixel = np.array([target.x_px, target.y_px])
         partner = None if alone else self.cameras.partner(target.camera)
         cameras = (target.camera,) if partner is None else (target.camera, partner)

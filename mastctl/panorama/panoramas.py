@@ -265,7 +265,7 @@ class Panoramas:
             ray = self._rig().camera_in_rover(frame.camera, *frame.true_rad).ray(seen.pixel_px)
             position = (ray.origins_m + seen.range_m * ray.directions).tolist()
             return request.model_copy(update={"panorama": None, "position_m": position}), None
-        self._devices.hold(frame, HOLDER, KEPT)
+        self._devices.store.keep(frame, HOLDER, KEPT)
         x, y = seen.pixel_px.tolist()
         pixel = PixelTarget(frame.camera, frame.frame_id, x, y, frame.mast_digest)
         return request.model_copy(update={"panorama": None, "pixel": pixel}), frame.true_rad

@@ -136,7 +136,7 @@ class Service:
             [Attached(config.path.name, config.data)],
             {"hardware": hardware.kind, "version": self._version},
             publisher,
-            self.devices.frame_by_id,
+            self.devices.store.by_id,
             self.event_value,
             clock,
         )
@@ -396,7 +396,7 @@ class Service:
         such camera.
         """
         self.check_camera(camera)
-        frame = self.devices.frame_by_id(frame_id)
+        frame = self.devices.store.by_id(frame_id)
         if frame.camera != camera:
             raise wrong_camera(frame, camera)
         return frame
@@ -484,7 +484,7 @@ class Service:
         frame_id = last_frame(operation.result)
         if frame_id is not None:
             with contextlib.suppress(MastctlError):  # it is gone already: the mast file has changed
-                self.devices.hold(self.devices.frame_by_id(frame_id), OPERATIONS, KEPT_PICTURES)
+                self.devices.store.keep(self.devices.store.by_id(frame_id), OPERATIONS, KEPT_PICTURES)
 
     def _handed_over(self, handoff: MatchedHandoff) -> None:
         """Have a hand-off counted and recorded."""

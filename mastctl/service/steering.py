@@ -16,7 +16,7 @@ from mastctl.devices.devices import Devices
 from mastctl.devices.frames import check_known
 from mastctl.devices.judge import Limits
 from mastctl.drift.watch import DriftWatch
-from mastctl.errors import NotNow, Stopped
+from mastctl.errors import NoLonger, NotNow, Stopped
 from mastctl.motion.loop import PointingLoop
 from mastctl.motion.requests import (
     PixelTarget,
@@ -99,7 +99,7 @@ class Steering:
             loop = self._loop()
 
             def run(record: Callable[[Any], None], cancelled: threading.Event) -> Any:
-                with self._devices.exposure_held():
+                with self._devices.settings.fixed():
                     return loop(record, cancelled).run(request, view_rad)
 
             return self._operations.start(recorded, run, partial(self._drift.ended, mast.stored))
@@ -195,9 +195,12 @@ class Steering:
             raise NotNow("other_mast_file", message)
 
     def _check_pixel(self, target: PixelTarget) -> None:
-        find = partial(self._devices.frame_by_id, max_age_s=CLICK_AGE_S)
-        frame = clicked_frame(target, self.rig, find)
-        self._devices.hold(frame)  # until it has been found again, however many images are watched
+        frame = clicked_frame(target, self.rig, self._devices.store.by_id)
+        age_s = self._clock.now_s() - frame.mid_exposure_s
+        if age_s > CLICK_AGE_S:
+            message = f"frame {frame.frame_id} is {age_s:.0f} s old, at most {CLICK_AGE_S:.0f} s is allowed"
+            raise NoLonger("frame_too_old", message)
+        self._devices.store.publish(frame)  # kept until it has been found again, however many are watched
         self._check_rover_stands(frame.camera, frame.exposure_began_s)
 
     def _check_rover_stands(self, camera: str, exposure_began_s: float) -> None:

@@ -22,7 +22,7 @@ from anyio.to_thread import run_sync
 
 from drivers.clock import Clock
 from drivers.errors import DriverError
-from mastctl.devices.frames import StampedFrame
+from mastctl.devices.frames import FrameStore, StampedFrame
 from mastctl.errors import MastctlError
 from mastctl.report.pictures import encoded
 
@@ -52,8 +52,8 @@ class LiveCameras(Protocol):
     def watched_frame(
         self, camera: str, exposed_after_s: float, max_age_s: float, timeout_s: float
     ) -> StampedFrame: ...
-    def hold(self, frame: StampedFrame, by: str, kept: int) -> None: ...
-    def let_go(self, by: str) -> None: ...
+    @property
+    def store(self) -> FrameStore: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,7 +151,7 @@ class CameraFeeds:
             yield viewer
         finally:
             self._viewers.discard(viewer)
-            self._cameras.let_go(viewer.name)
+            self._cameras.store.release(viewer.name)
             self.stir()
 
     def stir(self) -> None:
@@ -198,14 +198,14 @@ class CameraFeeds:
 
         def prepared() -> list[Picture]:
             for viewer in ready:
-                self._cameras.hold(made.frame, viewer.name, viewer.kept_of(made.frame))
+                self._cameras.store.keep(made.frame, viewer.name, viewer.kept_of(made.frame))
             return [made.within(viewer.most_bytes[camera]) for viewer in ready]
 
         for viewer, picture in zip(ready, await self._in_thread(prepared), strict=True):
             if viewer in self._viewers:
                 viewer.put(picture)
             else:  # it left before the frame was kept for it, which would be kept for ever
-                self._cameras.let_go(viewer.name)
+                self._cameras.store.release(viewer.name)
 
     async def _wanted(self, camera: str) -> bool:
         """Wait until a viewer is ready for a picture; False if there is no viewer any more."""

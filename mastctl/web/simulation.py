@@ -160,9 +160,9 @@ def _time(service: Service) -> answers.SimulationTime:
 
 
 def _truth(service: Service, query: TruthQuery) -> answers.PointTruth:
-    """The truth requested. Raises NoLonger and as `frame_by_id`."""
+    """The truth requested. Raises NoLonger and as `FrameStore.by_id`."""
     rover = _rover(service, "truths")
-    frame = service.devices.frame_by_id(query.frame_id)
+    frame = service.devices.store.by_id(query.frame_id)
     try:
         site_from_rover = rover.frame_truth(frame.camera, frame.sequence).site_from_rover
         if query.pixel_px is not None:

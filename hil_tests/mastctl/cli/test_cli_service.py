@@ -174,7 +174,7 @@ def test_stop_tells_what_it_stopped(run: Run, pair: BOTH) -> None:
 def test_a_snapshot_becomes_a_file(run: Run, pair: BOTH, tmp_path: Path) -> None:
     out = tmp_path / "left.png"
     shot = document(run("snapshot", "navcam_left", "--out", str(out), "--json"))
-    kept = pair[0].service.devices.frame_by_id(shot["frame_id"])
+    kept = pair[0].service.devices.store.by_id(shot["frame_id"])
     np.testing.assert_array_equal(cv2.imread(str(out), cv2.IMREAD_UNCHANGED), kept.image)
     assert shot["mast_digest"] == pair[0].service.stored.digest
     assert shot["size_px"] == [64, 48]

@@ -207,7 +207,7 @@ def test_a_lost_line_is_forgotten_when_any_call_finds_it_back(
 
 def stop_polling(devices: Devices) -> None:
     """From now on the head is only read when somebody asks."""
-    devices._head.call("no polls", lambda: setattr(devices._head, "_between", None), 1.0)
+    devices._head.call("no polls", lambda: devices._head.poll("none", lambda: None, 1.0), 1.0)
 
 
 @pytest.mark.parametrize("error", [NoReply("lost on the line"), BadReply("damaged on the line")])
@@ -268,7 +268,7 @@ def test_stop_goes_before_moves_that_wait_and_they_are_never_sent(
             refused.append(error)
 
     mover = clock.begun(move)
-    clock.until(lambda: devices._head._jobs, "the move waits")
+    clock.until(lambda: devices._head._waiting, "the move waits")
     devices.stop()
     assert hardware.head.calls == [("stop",)]  # beside the hanging thread
     hang.let_go()
@@ -326,7 +326,7 @@ def test_a_frame_carries_its_facts(devices: Devices, hardware: FakeHardware) -> 
     assert frame.pan_rad == pytest.approx(0.25, abs=ANGLE_TOLERANCE_RAD)
     assert frame.tilt_rad == pytest.approx(-0.125, abs=ANGLE_TOLERANCE_RAD)
     assert not frame.image.flags.writeable
-    assert devices.frame_by_id(frame.frame_id) is frame
+    assert devices.store.by_id(frame.frame_id) is frame
 
 
 def test_cameras_are_asked_in_parallel(devices: Devices, hardware: FakeHardware, clock: Turned) -> None:
@@ -463,7 +463,7 @@ def test_count_and_time_must_grow_together(devices: Devices, hardware: FakeHardw
     assert again.sequence == first.sequence + step
     assert again.frame_id != first.frame_id
     with pytest.raises(NotKnown):
-        devices.frame_by_id(first.frame_id)
+        devices.store.by_id(first.frame_id)
 
 
 def test_the_next_count_of_an_earlier_moment_is_no_next_picture(
@@ -540,7 +540,7 @@ def test_only_the_newest_frames_are_kept_and_refusals_differ(devices: Devices) -
     }
     for frame_id, code in cases.items():
         with pytest.raises(MastctlError) as refused:
-            devices.frame_by_id(frame_id)
+            devices.store.by_id(frame_id)
         assert refused.value.code == code, frame_id
 
 

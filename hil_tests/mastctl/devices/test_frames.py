@@ -35,16 +35,16 @@ def test_frames_of_those_who_watch_have_a_total_and_the_oldest_give_way(
     monkeypatch.setattr(frames_module, "WATCHED_BYTES", 10_000_000)
     store = FrameStore(DIGEST)
     for number in range(3):
-        store.hold(frame(number, FRAME), OPERATIONS, 3)  # of results: they stay
+        store.keep(frame(number, FRAME), OPERATIONS, 3)  # of results: they stay
     for number in range(3, 100):
         for watcher in range(3):  # each frame counts once, for however many it is kept
-            store.hold(frame(number, FRAME), f"watcher {number} {watcher}", 4)
+            store.keep(frame(number, FRAME), f"watcher {number} {watcher}", 4)
     assert kept(store, range(100)) == [0, 1, 2, *range(90, 100)]
     for number in range(95, 100):
         for watcher in range(3):
-            store.let_go(f"watcher {number} {watcher}")
+            store.release(f"watcher {number} {watcher}")
     for number in range(100, 105):
-        store.hold(frame(number, FRAME), "watcher again", 32)
+        store.keep(frame(number, FRAME), "watcher again", 32)
     assert kept(store, range(110)) == [0, 1, 2, *range(90, 95), *range(100, 105)], "what was let go is free"
 
 
@@ -53,9 +53,11 @@ def test_of_however_many_frames_a_camera_has_a_fixed_number_stays() -> None:
     for number in range(2000):
         one = replace(frame(number, FRAME), mast_digest=DIGEST)
         alive.add(one)
-        store.add(one, number % 3 == 0)
+        store.add(one)
+        if number % 3 == 0:
+            store.publish(one)
         if number % 40 == 0:
-            store.hold(one, OPERATIONS, 8)
+            store.keep(one, OPERATIONS, 8)
         del one
     gc.collect()
     assert KEPT_FRAMES < len(alive) <= 2 * KEPT_FRAMES + 8, (

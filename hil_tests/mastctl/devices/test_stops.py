@@ -17,7 +17,7 @@ from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from hil_tests.waiting import NET_S, until
 from mastctl.devices import devices as devices_module
 from mastctl.devices.devices import Devices
-from mastctl.devices.thread import DeviceThread, next_try_s
+from mastctl.devices.thread import REST_S, DeviceThread, next_try_s
 from mastctl.errors import MastctlError, Stopped
 
 DEADLINE_S = 1.0
@@ -282,7 +282,7 @@ def test_rest_after_a_move_of_before_the_stop_proves_nothing(
     fault = one_fault(devices)
     hardware.head.moving = False
     since_s = clock.now_s()
-    clock.until(lambda: clock.now_s() > since_s + 2 * devices_module.REST_S and devices.read(), "rest")  # type: ignore[attr-defined]
+    clock.until(lambda: clock.now_s() > since_s + 2 * REST_S and devices.read(), "rest")
     assert devices.faults() == (fault,)
     hardware.head.hook = lambda name: None
     devices.move(0.3, 0.1)
@@ -298,7 +298,8 @@ def test_a_call_given_up_at_its_deadline_is_overdue_for_the_next() -> None:
             with pytest.raises(NoReply, match="did not end within its deadline"):
                 thread.call("read", hang, 1.0)
             with pytest.raises(NoReply, match=r"read has been under way for 1\.0 s"):
-                thread.submit("read", lambda: None, 1.0)
+                thread.call("read", lambda: None, 1.0)
         finally:
             hang.let_go()
-    assert thread.close(60.0)
+    thread.close(60.0)
+    assert not any(one.name == "device pan_tilt" for one in threading.enumerate())

@@ -121,6 +121,7 @@ class World:
     scene: Callable[[], TexturedPlane | Edge] = ground
 
     def __post_init__(self) -> None:
+        self.store = self.settings = self.judge = self  # as parts of the devices
         self._from = self._to = (0.0, -0.45)
         self._begun_s = self.clock.now_s()
         self._slip = (0.0, 0.0)
@@ -182,12 +183,12 @@ class World:
         self.clock.advance(0.05)
         return taken
 
-    def frame_by_id(self, frame_id: str) -> StampedFrame:
+    def by_id(self, frame_id: str) -> StampedFrame:
         if frame_id not in self._frames:
             raise NotKnown("frame_unknown", f"frame {frame_id} was not taken here")
         return self._frames[frame_id]
 
-    def exposure_held(self) -> AbstractContextManager[None]:
+    def fixed(self) -> AbstractContextManager[None]:
         return nullcontext()
 
     def check_from(self, start: Pair, goal: Pair) -> None:

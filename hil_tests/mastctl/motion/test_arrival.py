@@ -32,6 +32,7 @@ class Turning:
 
     def __init__(self, at: Callable[[float], tuple[float, float, bool]]) -> None:
         self.at = at
+        self.judge = self
         self.clock = ManualClock(100.0)
         self.moves: list[tuple[float, float]] = []
         self.stamp: Callable[[Reading], Reading] = lambda reading: reading

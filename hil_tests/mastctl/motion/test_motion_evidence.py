@@ -132,7 +132,7 @@ def test_a_residual_is_told_with_how_old_the_pictures_behind_it_may_be() -> None
     told = result["pointings"][0]["motion_evidence"]["navcam_left"]
     assert told["repeated_after_s"] >= 1.0 and np.abs(told["apart_px"]).max() < 0.2
     settled = next(step for step in steps if step["name"] == "settle")
-    began_s = world.frame_by_id(result["pointings"][0]["frame_id"]).exposure_began_s
+    began_s = world.by_id(result["pointings"][0]["frame_id"]).exposure_began_s
     assert told["fresh_to_s"] == pytest.approx(
         began_s - settled["started_s"] - settled["duration_s"], abs=0.01
     )

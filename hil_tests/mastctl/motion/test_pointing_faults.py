@@ -165,7 +165,7 @@ class Rover:
                 self.clock.sleep(0.01)
 
     def true_residual_px(self, result: PointingResult, point: np.ndarray) -> np.ndarray:
-        frame = self.devices.frame_by_id(result["pointings"][-1]["frame_id"])
+        frame = self.devices.store.by_id(result["pointings"][-1]["frame_id"])
         middle = self.rig.cameras["navcam_left"].model.image_center_px
         return self.truth.true_pixel("navcam_left", frame.sequence, point) - np.array(middle)
 

@@ -186,7 +186,7 @@ def test_the_new_picture_is_exposed_after_the_head_has_settled() -> None:
     frame = world.shoot()
     result, steps = run(world, click(frame, 100.0, 90.0))
     settled = next(step for step in steps if step["name"] == "settle")
-    new = world.frame_by_id(result["pointings"][0]["frame_id"])
+    new = world.by_id(result["pointings"][0]["frame_id"])
     assert new.exposure_began_s >= settled["started_s"] + settled["duration_s"]
 
 

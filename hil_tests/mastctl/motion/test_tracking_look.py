@@ -208,7 +208,7 @@ def test_a_change_of_the_pair_looks_with_both_and_keeps_what_they_saw() -> None:
         assert landed.geometric_px == pytest.approx(true, abs=0.3)
         assert landed.found_px == pytest.approx(true, abs=0.3)
     for eye, at in (("pancam_left", record.joints), ("navcam_left", record.to_joints)):
-        frame = world.frame_by_id(frames[eye])
+        frame = world.by_id(frames[eye])
         assert (at.pan_rad, at.tilt_rad) == (frame.pan_rad, frame.tilt_rad)
     assert record.joints.tilt_rad != record.to_joints.tilt_rad
     assert search(world).find(after, "navcam")[1].matched is None, "the same pair looks on"

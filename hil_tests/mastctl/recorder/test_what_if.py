@@ -59,7 +59,7 @@ def recorded(mast_file: Path, true_file: Path, folder: Path) -> Path:
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
         publisher, service = Publisher(), daemon.service
         facts = {"hardware": "simulated"}
-        find = service.devices.frame_by_id
+        find = service.devices.store.by_id
         answers, clock = service.event_value, service.clock
         recorder = Recorder(settings, folder, lambda: mast, attached, facts, publisher, find, answers, clock)
         recorder.start_run("")

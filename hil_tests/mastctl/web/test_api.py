@@ -266,7 +266,7 @@ def test_a_snapshot_is_the_picture_with_its_facts(web: httpx.Client, daemon: Run
     shot = web.get("/snapshot/navcam_left")
     assert shot.headers["content-type"] == "image/png"
     frame_id = shot.headers["Mastctl-Frame-Id"]
-    kept = daemon.service.devices.frame_by_id(frame_id)
+    kept = daemon.service.devices.store.by_id(frame_id)
     np.testing.assert_array_equal(cv2.imdecode(np.frombuffer(shot.content, np.uint8), -1), kept.image)
     assert shot.headers["Mastctl-Camera"] == "navcam_left"
     assert int(shot.headers["Mastctl-Sequence"]) == kept.sequence

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ class FakeCameras:
     """Gives pictures, and counts those that are kept for each viewer; ``as_kept`` is called before each."""
 
     def __init__(self) -> None:
+        self.store: Any = self
         self.kept: Counter[str] = Counter()
         self.glances: Counter[str] = Counter()
         self.after_s: list[float] = []
@@ -43,13 +45,13 @@ class FakeCameras:
         self.given.append(frame(self.glances[camera], np.zeros((4, 4), np.uint8), b"jpeg", camera))
         return self.given[-1]
 
-    def hold(self, frame: StampedFrame, by: str, kept: int) -> None:
+    def keep(self, frame: StampedFrame, keeper: str, most: int) -> None:
         self.as_kept()
-        self.kept[by] += 1
+        self.kept[keeper] += 1
 
-    def let_go(self, by: str) -> None:
+    def release(self, keeper: str) -> None:
         self.released += 1
-        self.kept.pop(by, None)
+        self.kept.pop(keeper, None)
 
 
 async def shown(viewer: Viewer) -> list[Picture]:

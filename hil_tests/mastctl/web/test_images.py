@@ -43,7 +43,7 @@ def test_a_picture_comes_with_its_facts_and_uncompressed(pair: BOTH) -> None:
     with watching(daemon.url, LEFT) as line:
         facts, image = received(line)
         assert line.protocol.extensions == []
-    frame = daemon.service.devices.frame_by_id(facts["frame_id"])
+    frame = daemon.service.devices.store.by_id(facts["frame_id"])
     assert facts["camera"] == LEFT
     for name in ("mid_exposure_s", "pan_rad", "tilt_rad", "mast_digest", "moving", "exposure_s"):
         assert facts[name] == getattr(frame, name)

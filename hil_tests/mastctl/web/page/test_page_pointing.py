@@ -18,7 +18,6 @@ from hil_tests.waiting import NET_S, until
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.daemon import RunningDaemon
-from mastctl.devices import cameras
 from mastctl.panorama.folder import Folder
 
 Visits = Callable[..., Visit]
@@ -31,10 +30,8 @@ def rover(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
     config = simulated(folder, "memory", ("navcam_left", "navcam_right"))
     document = yaml.safe_load(config.read_text())
     document["simulation"]["speed"] = 3.0
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(cameras, "WATCHED_SHARE", 0.5)  # the page's pictures matter here
-        with RunningDaemon(load_config(written(folder, document))) as daemon:
-            yield daemon
+    with RunningDaemon(load_config(written(folder, document))) as daemon:
+        yield daemon
 
 
 def test_a_rock_is_clicked_pointed_at_and_its_residual_read(rover: RunningDaemon, visit: Visits) -> None:
