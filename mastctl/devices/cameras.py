@@ -44,7 +44,7 @@ HOLD_TIMEOUT_S = 3.0  # a driver waits up to 2 s for changes under way to show
 SET_TIMEOUT_S = 2.0
 
 
-class CameraSettings:
+class SettingsInUse:
     """The settings of all cameras, changed between operations; safe from any thread.
 
     ``cameras`` and ``threads`` may get other entries later. ``clock`` stamps the faults.
@@ -177,7 +177,7 @@ class Cameras:
     ) -> None:
         self._cameras = dict(cameras)
         self._threads: dict[str, DeviceThread] = {}
-        self.settings = CameraSettings(self._cameras, self._threads, clock)
+        self.settings = SettingsInUse(self._cameras, self._threads, clock)
         self.store = store
         self._history = history
         self._read_head = read
