@@ -528,7 +528,7 @@ def published_value(topic: Topic, value: Any, now_s: float) -> Any:
         case "fault":
             return [one.as_json(now_s) for one in value]
         case "frame":
-            return as_json(value) | {"age_s": max(0.0, now_s - value.facts.mid_exposure_s)}
+            return as_json(value) | {"age_s": max(0.0, now_s - value.mid_exposure_s)}
         case "operation":
             return value.as_json()
         case "command":  # without the key, by which others would get the answer, and a lease with it
