@@ -347,10 +347,8 @@ class CommandEntry:
         self.record(command, sent, answer, None, again)
         return answer
 
-    def first(
-        self, command: Command, sent: CommandRequest, act: Callable[[], Answer], recorded: bool = True
-    ) -> Answer:
-        """Carry out a stop: it acts before anything is checked or written, and is ``recorded`` after."""
+    def first(self, command: Command, sent: CommandRequest, act: Callable[[], Answer]) -> Answer:
+        """Carry out a stop: it acts before anything is checked or written, and is recorded after."""
         by = sent.caller.name
         how = f"an emergency stop ({by})" if command is ESTOP else by
         self.leases.stop_came(f"the head was stopped by {how}")  # takes no lock
@@ -362,8 +360,7 @@ class CommandEntry:
             error = failure
             raise
         finally:
-            if recorded:
-                self.record(command, sent, answer, error)
+            self.record(command, sent, answer, error)
 
     def refused(self, caller: Caller, command: str, code: str, message: str) -> None:
         """Record a request that was refused before it was a command. It is not published."""

@@ -15,7 +15,7 @@ import logging
 import threading
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -82,21 +82,6 @@ class Latch:
                 self.since_s = time.monotonic()
             self.entries = _merged((*self.entries, cause))
             return next((one for one in self.entries if _same(one, cause)), cause)
-
-    def explain(self, reason: str | None, name: str | None) -> Latched | None:
-        """Give the cause without name and reason those that came after its stop; return it.
-
-        None if there is no such cause.
-        """
-        with self._changed:
-            bare = next((one for one in self.entries if (one.name, one.reason) == BARE), None)
-            if bare is None:
-                return None
-            self._count += 1  # a reset that is under way has not released this
-            cause = replace(bare, name=_line(name) or BARE[0], reason=_line(reason) or BARE[1])
-            self.entries = _merged(cause if one is bare else one for one in self.entries)
-            self._changed.notify_all()
-            return cause
 
     def keep(self, timeout_s: float) -> bool:
         """Have the disk hold what is latched; return whether it does within ``timeout_s`` seconds."""

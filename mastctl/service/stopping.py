@@ -132,8 +132,7 @@ class Stopping:
     def estop(self, reason: str | None = None, name: str | None = None) -> EstopAnswer:
         """Stop the mast, and let nothing move it before `reset`, across restarts too.
 
-        The head first; then what runs and the track end; then the disk is waited for. A reason may follow
-        (`explain_estop`).
+        The head first; then what runs and the track end; then the disk is waited for.
 
         Returns the answer of ``POST /estop``: ``latched``, ``kept`` (a restart would find it; else
         ``message`` says why not), ``operation``, and ``reason``, ``name`` and ``at`` of the stop that is
@@ -170,14 +169,6 @@ class Stopping:
         with self._operations.stopping():
             cause = self._latch.add(reason, name)
             self._machine.estop_requested(lambda: self._latch.entries)
-        return cause
-
-    def explain_estop(self, reason: str | None, name: str | None) -> Latched | None:
-        """Add the name and the reason that came after their stop; return its cause if that has changed."""
-        cause = self._latch.explain(reason, name) if reason or name else None
-        if cause is not None:  # else there is none left to explain, after a reset for example
-            with self._operations.stopping():
-                self._machine.estop_requested(lambda: self._latch.entries)
         return cause
 
     def reset(self, reason: str, name: str) -> ResetAnswer:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import inspect
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from inspect import Parameter
@@ -173,27 +173,15 @@ async def stop_first(
     request: Request,
     act: Callable[[], Answer],
     sent: Mapping[str, Any] = NOTHING,
-    late: Callable[[], Awaitable[Mapping[str, Any]]] | None = None,
 ) -> Answer:
-    """Return the answer of a stop, which acts before any check.
-
-    ``late`` returns what was ``sent`` after that; the stop is recorded with it then.
-    """
+    """Return the answer of a stop, which acts before any check."""
     requested = CommandRequest(caller_of(request), request=sent, lease=request.headers.get("mastctl-lease"))
-    entry, answer, failure = here.service.entry, None, None
+    entry = here.service.entry
     try:
-        answer = await stopped(here.service, lambda: entry.first(kind, requested, act, late is None))
-        return answer
-    except BaseException as error:
-        failure = error
+        return await stopped(here.service, lambda: entry.first(kind, requested, act))
+    except StopsHang as error:
+        entry.record(kind, requested, None, error)
         raise
-    finally:
-        try:
-            if late is not None:
-                requested = replace(requested, request=await late())
-        finally:
-            if late is not None or isinstance(failure, StopsHang):
-                entry.record(kind, requested, answer, failure)
 
 
 async def stopped(service: Service, stop: Callable[[], T]) -> T:

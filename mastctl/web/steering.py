@@ -15,7 +15,6 @@ from mastctl import answers
 from mastctl.control import entry
 from mastctl.control.entry import CommandRequest
 from mastctl.control.lease import Lease, LeaseTable, client_name
-from mastctl.control.machine import Latched
 from mastctl.errors import BadRequest, NotNow, Unable, one_line
 from mastctl.http import PREFIX
 from mastctl.motion.jog import JogBeat
@@ -35,7 +34,7 @@ from mastctl.web.models import (
     TakeBody,
 )
 
-BODY_S = 1.0  # what a stop that has been carried out waits for its reason
+BODY_S = 0.02  # how long an emergency stop waits for a reason that did not come with its request
 LARGEST_BODY_BYTES = 4096
 ANY_BODY = {"anyOf": [EstopBody.model_json_schema(), {}]}  # a stop is refused for no body
 
@@ -119,25 +118,12 @@ def add_estop(app: FastAPI) -> None:
     )
     async def estop(request: Request, here: Here) -> answers.EstopAnswer:
         stopping = here.service.stopping
-        reading = asyncio.ensure_future(_reason_and_name(request))
-        await asyncio.wait([reading], timeout=0)  # one turn of the loop: what came with the request is read
-        follows = not reading.done()
-        given = {"reason": None, "name": None} if follows else reading.result()
-        stop = partial(stopping.estop, **given)
-        cause: Latched | None = None
-
-        async def late() -> dict[str, str | None]:
-            nonlocal cause, given
-            given = await reading
-            cause = stopping.explain_estop(**given)
-            return given
-
+        given = await _reason_and_name(request)
         try:
-            answer = await stop_first(here, entry.ESTOP, request, stop, given, late if follows else None)
+            return await stop_first(here, entry.ESTOP, request, partial(stopping.estop, **given), given)
         except StopsHang as error:
             await here.waiting.run(lambda: stopping.latch_estop(**given))
             raise Unable("stop_unconfirmed", f"the emergency stop is latched, but {error}") from None
-        return answer if cause is None else {**answer, "reason": cause.reason, "name": cause.name}
 
     @command(app, "POST /reset", entry.RESET)
     def reset(body: ResetBody, here: Here) -> answers.ResetAnswer:

@@ -105,8 +105,6 @@ def test_a_latch_logs_its_causes_and_a_reset_releases_all(folder: StateFolder) -
     latch.add("smoke", "Ana")
     latch.add("a hand in the way", "Ben")
     latch.add("smoke", "Ana")  # once in the log
-    latch.add(None, None)
-    latch.explain("smoke", "Ana")  # nor twice if it came after its stop
     latch.add("sparks", "Ana")
     for number in range(10):
         latch.add("a stranger", f"client {number}")
