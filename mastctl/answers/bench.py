@@ -77,7 +77,6 @@ class BenchResult(TypedDict):
     counts_px: float | None
     pictures: Count
     placements: Count
-    rover_seconds: float | None
 
 
 class BenchProgress(TypedDict):

@@ -14,8 +14,9 @@ from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import triangulate
 from calib.plan.knowledge import BenchShot
 from calib.plan.poses import candidates
+from calib.targets.boards import Corners
 from mastctl.bench.known import BenchKnowledge
-from mastctl.bench.mast import BenchLook, BenchMast, NotThere, SeenBoard
+from mastctl.bench.mast import BenchLook, BenchMast, NotThere
 
 POINTINGS = 4
 
@@ -33,14 +34,6 @@ class CornerPointing:
     turned_deg: float
     residual_px: tuple[float, float]
     promised_px: float
-
-    def sentence(self) -> str:
-        """Return it as a line for a terminal."""
-        x, y = self.residual_px
-        return (
-            f"pointed at corner {self.corner}, {self.turned_deg:.0f} degrees off: residual {x:+.2f}, "
-            f"{y:+.2f} px (promised {self.promised_px:.2f})"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,38 +81,35 @@ def point_at_corners(
 ) -> Iterator[CornerPointing]:
     """Point once at corners that former looks show off the middle, and yield what was measured."""
     rng = np.random.default_rng(len(clicked))
-    cameras = known.workspace.cameras
     done = 0
     for look in [*clicked, *clicked]:
-        if done >= POINTINGS:
-            return
-        seen = {one.camera: one for one in look.found}
-        if any(camera not in seen for camera in cameras):
+        seen = {one.camera: one.corners for one in look.found if one.corners is not None}
+        if not set(known.workspace.cameras) <= set(seen):
             continue
-        ids = [set(one.corners.ids.tolist()) for name in cameras if (one := seen[name]).corners is not None]
+        ids = [set(seen[name].ids.tolist()) for name in known.workspace.cameras]
         common = np.array(sorted(set.intersection(*ids)))
         rng.shuffle(common)
-        for corner in common[:2]:
-            pointing = _point(mast, known, placement, look, seen, int(corner))
-            if pointing is not None:
-                done += 1
-                yield pointing
-                break
+        pointings = (_pointing(mast, known, placement, look, seen, int(corner)) for corner in common[:2])
+        pointing = next((one for one in pointings if one is not None), None)
+        if pointing is not None:
+            yield pointing
+            done += 1
+            if done == POINTINGS:
+                return
 
 
-def _point(
+def _pointing(
     mast: BenchMast,
     known: BenchKnowledge,
     placement: str,
     look: BenchLook,
-    seen: Mapping[str, SeenBoard],
+    seen: Mapping[str, Corners],
     corner: int,
 ) -> CornerPointing | None:
     """Bring one corner to the middle of the first camera's image; None where that cannot be tried."""
     rig, cameras, head = known.now.rig, known.workspace.cameras, mast.head
-    sides = look.pan_approach, look.tilt_approach
-    pan_rad, tilt_rad = rig.joints.true_rad((look.pan_rad, look.tilt_rad), sides)
-    models = [rig.camera_in_rover(name, pan_rad, tilt_rad) for name in cameras]
+    now_rad = rig.joints.true_rad((look.pan_rad, look.tilt_rad), (look.pan_approach, look.tilt_approach))
+    models = [rig.camera_in_rover(name, *now_rad) for name in cameras]
     pixels = [_pixel(seen[name], corner) for name in cameras]
     model = rig.cameras[cameras[0]].model
     try:
@@ -129,30 +119,25 @@ def _point(
             ray = models[0].ray(pixels[0])
             (by_fit_m,) = known.now.boards[placement].points(known.board.in_board_m(np.array([corner])))
             point = ray.origins_m + ray.directions * float(np.linalg.norm(by_fit_m - ray.origins_m))
-        found = solve(rig.mast, model, point, from_pan_rad=pan_rad, from_tilt_rad=tilt_rad)
+        found = solve(rig.mast, model, point, from_pan_rad=now_rad[0], from_tilt_rad=now_rad[1])
         angles = choose(
             found, head.pan_limits_rad, head.tilt_limits_rad, look.pan_rad, look.tilt_rad,
             read=lambda one: rig.joints.read_rad((one.pan_rad, one.tilt_rad)),
         )  # fmt: skip
-    except (Unreachable, CalibError):
-        return None
-    sides = (0, 0)
-    if not head.one_sided:
-        sides = (1 if angles.pan_rad > pan_rad else -1, 1 if angles.tilt_rad > tilt_rad else -1)
-    try:
+        turn_rad = angles.pan_rad - now_rad[0], angles.tilt_rad - now_rad[1]
+        sides = (0, 0) if head.one_sided else (1 if turn_rad[0] > 0 else -1, 1 if turn_rad[1] > 0 else -1)
         landed = mast.look(*rig.joints.read_rad((angles.pan_rad, angles.tilt_rad), sides), sides)
-    except NotThere:
+    except (Unreachable, CalibError, NotThere):
         return None
-    again = next((one for one in landed.found if one.camera == cameras[0]), None)
-    if again is None or again.corners is None or corner not in again.corners.ids:
+    again = next((one.corners for one in landed.found if one.camera == cameras[0]), None)
+    if again is None or corner not in again.ids:
         return None
     x, y = _pixel(again, corner) - np.asarray(model.image_center_px)
-    turned_rad = math.hypot(angles.pan_rad - pan_rad, angles.tilt_rad - tilt_rad)
     promised_px = math.hypot(known.predicted_px(), known.counts_px, math.sqrt(2.0) * known.sought.sigma_px)
     range_m = float(np.linalg.norm(point - models[0].C))
-    return CornerPointing(corner, range_m, math.degrees(turned_rad), (float(x), float(y)), promised_px)
+    turned_deg = math.degrees(math.hypot(*turn_rad))
+    return CornerPointing(corner, range_m, turned_deg, (float(x), float(y)), promised_px)
 
 
-def _pixel(seen: SeenBoard, corner: int) -> FloatArray:
-    assert seen.corners is not None
-    return np.asarray(seen.corners.pixels_px[int(np.flatnonzero(seen.corners.ids == corner)[0])])
+def _pixel(corners: Corners, corner: int) -> FloatArray:
+    return np.asarray(corners.pixels_px[int(np.flatnonzero(corners.ids == corner)[0])])

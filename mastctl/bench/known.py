@@ -1,13 +1,12 @@
 """The knowledge of a run: all that was seen, the rig that follows from it, and how well it would point.
 
-What is seen goes to the disk first. It is fitted beside the next moves, whenever there is a fifth more of it.
+What is seen goes to the disk first. It is fitted whenever there is half as much more of it.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -45,6 +44,9 @@ CORNERS, APART = ((0.05, 0.05), (0.95, 0.95), (0.95, 0.05), (0.05, 0.95)), 0.15
 """Where in the picture of a camera that does not point the board's middle should have been, in parts of width
 and height, and how far from there, in parts of the view, it may have been instead."""
 
+FIRST_FIT, MORE = 4, 1.5
+"""Looks before the first fit, and how many times as many before the next."""
+
 CELLS = (8, MOST_CELLS // 8)
 """Columns and rows into which an image is divided to count where corners were seen."""
 
@@ -56,7 +58,7 @@ BESIDE, BESIDE_AT_FIRST = 0.1, 0.5
 
 
 class BenchKnowledge:
-    """What was seen, what follows from it, and the fit of it that is under way.
+    """What was seen, and what follows from it.
 
     ``kept`` is the survey's folder, whose looks are known already; ``say`` shows what a fit refuses. Of the
     estimate, ``now`` is the rig with the boards' places, ``sought`` what a shot has to show, ``aim`` and
@@ -86,13 +88,8 @@ class BenchKnowledge:
         self.shots: list[BenchShot] = []
         self.fitted: BenchCalibration | None = None
         self.fitted_looks = 0
+        self._tried_looks = 0
         self._scale = 1.0
-        self._pool = ThreadPoolExecutor(1, "bench-fit")
-        self._pending: tuple[int, Future[BenchCalibration]] | None = None
-
-    def end(self) -> None:
-        """Fit no more."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
 
     @property
     def counts_px(self) -> float:
@@ -210,37 +207,44 @@ class BenchKnowledge:
         return {camera: math.sqrt(np.mean(values)) for camera, values in squares.items()}
 
     def take(self, name: str, look: BenchLook, check: bool = False) -> None:
-        """Keep a look at a placement, add it to what is known, and fit beside what comes next if it is
-        worth it."""
+        """Keep a look at a placement, add it to what is known, and fit if there is much more of it."""
         self.kept.add(name, look, check)
         self.looks.append((name, check, look))
         if name not in self.now.boards:
             self.now = replace(self.now, boards={**self.now.boards, name: self._board_from(look)})
-        if not check:
-            self.shots.append(self._shot(name, look))
-        self.collect()
-        to_fit = sum(1 for _, is_check, _ in self.looks if not is_check)
-        if not check and self._pending is None and _worth_a_fit(to_fit, self.fitted_looks):
-            self._pending = len(self.looks), self._pool.submit(self._fit, self.kept.survey())
-
-    def collect(self, wait: bool = False) -> None:
-        """Take over a fit that is ready; with ``wait``, the one under way. One that fails is reported."""
-        if self._pending is None or not (wait or self._pending[1].done()):
+        if check:
             return
-        looks, future = self._pending
-        self._pending = None
+        self.shots.append(self._shot(name, look))
+        if len(self.looks) >= max(FIRST_FIT, MORE * self._tried_looks):
+            self.try_fit()
+
+    def try_fit(self) -> None:
+        """Fit everything that was seen, if that can be; what hinders it is said."""
         try:
-            self._use(future.result(), looks)
+            self.fit()
         except CalibError as reason:
             self._say(f"no fit yet: {reason}")
 
     def fit(self) -> BenchCalibration:
-        """Return the fit of everything that was seen. Raises CalibError if it cannot be fitted."""
-        self.collect(wait=True)
-        if self.fitted is None or self.fitted_looks < len(self.looks):
-            self._use(self._fit(self.kept.survey()), len(self.looks))
-        assert self.fitted is not None
-        return self.fitted
+        """Return the fit of everything that was seen; it is the present estimate then.
+
+        Boards that it does not know stay where they were seen. Raises CalibError if it cannot be fitted.
+        """
+        if self.fitted is not None and self.fitted_looks == len(self.looks):
+            return self.fitted
+        self._tried_looks, survey = len(self.looks), self.kept.survey()
+        notes, rig = self.kept.notes, self.head.rig
+        self.fitted = fitted = fit_in_frame(survey, stated_mast(notes), rig, moved_placements(notes))
+        self.fitted_looks = len(self.looks)
+        body = {n: c for n, c in rig.cameras.items() if c.on == "rover"}
+        rig = replace(fitted.rig, cameras={**body, **fitted.rig.cameras})
+        boards = {placement: pose for (_, placement), pose in fitted.rover_from_board.items()}
+        self.now = replace(self.now, rig=rig, boards=boards)
+        rms_px, self._scale = corner_noise(fitted, survey)
+        self.sought = replace(self.sought, sigma_px=rms_px)
+        self.aim = pointing(self.now, self.workspace)
+        self.believe_boards()
+        return fitted
 
     def believe_boards(self) -> None:
         """See boards that no fit has placed with the present rig."""
@@ -254,23 +258,6 @@ class BenchKnowledge:
         self.shots = [
             self._shot(name, look) for name, check, look in self.looks if not check and name not in spoiled
         ]
-
-    def _fit(self, survey: Survey) -> BenchCalibration:
-        notes = self.kept.notes
-        return fit_in_frame(survey, stated_mast(notes), self.head.rig, moved_placements(notes))
-
-    def _use(self, fitted: BenchCalibration, looks: int) -> None:
-        """Let a fit of so many looks be the present estimate; boards that it does not know stay where they
-        were seen."""
-        self.fitted, self.fitted_looks = fitted, looks
-        body = {n: c for n, c in self.head.rig.cameras.items() if c.on == "rover"}
-        rig = replace(fitted.rig, cameras={**body, **fitted.rig.cameras})
-        boards = {placement: pose for (_, placement), pose in fitted.rover_from_board.items()}
-        self.now = replace(self.now, rig=rig, boards=boards)
-        rms_px, self._scale = corner_noise(fitted, self.kept.survey())
-        self.sought = replace(self.sought, sigma_px=rms_px)
-        self.aim = pointing(self.now, self.workspace)
-        self.believe_boards()
 
     def _shot(self, name: str, look: BenchLook) -> BenchShot:
         views = tuple(
@@ -298,11 +285,6 @@ def corner_noise(fit: BenchCalibration, survey: Survey) -> tuple[float, float]:
     own_px = np.median(np.concatenate([one.sigma_px for one in survey.corners.values()]))
     scale = float(np.sqrt(fit.chi2 / max(fit.degrees_of_freedom, 1.0)) * fitted_px / own_px)
     return max(rms_px, LEAST_PX), max(scale, LEAST_SCALE)
-
-
-def _worth_a_fit(looks: int, fitted: int) -> bool:
-    """Whether there is a fifth more to fit than the last time."""
-    return looks >= 4 and looks >= fitted + max(2, fitted // 5)
 
 
 def _within(limits_rad: tuple[float, float], usual_rad: tuple[float, float]) -> tuple[float, float]:

@@ -1,22 +1,27 @@
-"""The head and cameras of a daemon in front of a board, and the board of a simulated bench."""
+"""The head and cameras of a daemon in front of a board, the search for it, and a simulated bench's board."""
 
 from __future__ import annotations
 
+import math
+import re
 import time
-from collections.abc import Collection, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any, Protocol, cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.calibrate.bench import FEWEST_CORNERS
+from calib.errors import CalibError, Unreachable
 from calib.files.mast_file import parse_rig
 from calib.geometry.mode import FLIPS, SensorMode
 from calib.geometry.rig import Rig
+from calib.plan.knowledge import Knowledge
 from calib.plan.placements import Placement
+from calib.plan.poses import Sought, readings
 from calib.targets.board_file import document_of
 from calib.targets.boards import AnyBoard, Corners, CornersNotFound
 from calib.targets.corners import find_corners
@@ -37,9 +42,6 @@ COME_FROM_RAD = 0.06
 SIDE = 0.9
 """An approach of less than this has not gone through all of the play, and is treated as unknown."""
 
-DARK_DN, BRIGHT_DN = 12.0, 245.0
-"""Mean grey level at which a picture without a board is said to be too dark, or too bright."""
-
 LASTING = frozenset(
     {
         "leased", "lease_over", "lease_unknown", "estopped", "stopping", "no_daemon", "forbidden", "no_token",
@@ -50,6 +52,21 @@ LASTING = frozenset(
 
 BOARD = "bench"
 """The board's name in the simulation."""
+
+OVERLAP = 0.7
+"""Of a picture's view: how far apart the looks of a search are."""
+
+ANOTHER = ("another board", "mirrored", "two boards")
+"""What `calib.targets.corners` says of a board in view that is not the one that is looked for."""
+
+MOST_LOOKS = 100
+"""A narrow view would take hundreds, a quarter of an hour: the operator is consulted before."""
+
+LOOKS_BESIDE = 8
+"""Looks after such a one: the right board may hang beside it."""
+
+MOST_KINDS = 4
+"""So many things that were seen instead are reported, the most frequent."""
 
 
 class NotThere(MastctlError):
@@ -91,8 +108,7 @@ class SeenBoard:
 class BenchLook:
     """Cameras' images at one attitude at rest: what the joints read, radians, the cameras' mean.
 
-    Each joint came from smaller angles (1), from larger (-1), or it is unknown (0). It took ``seconds`` of
-    the rover's clock.
+    Each joint came from smaller angles (1), from larger (-1), or it is unknown (0).
     """
 
     seen: tuple[SeenBoard, ...]
@@ -100,7 +116,6 @@ class BenchLook:
     tilt_rad: float
     pan_approach: int = 0
     tilt_approach: int = 0
-    seconds: float = 0.0
 
     @property
     def cameras(self) -> tuple[str, ...]:
@@ -147,18 +162,17 @@ class BenchMast(Protocol):
         default of all.
 
         Raises NotThere if the head must not go there; NoLight if the images are too dark or too bright;
-        MastctlError if the head does not get there, or no camera gives an image.
+        BenchInterrupted if another client steers, a stop was pressed, the daemon is gone, or head or cameras
+        fail for longer than a cable takes to be put back.
         """
         ...
 
 
 class DaemonMast:
-    """Looks for a board through some cameras of a daemon, whose lease ``client`` should have; see
-    `BenchMast`."""
+    """The head and some cameras of a daemon, whose lease ``client`` should have; see `BenchMast`."""
 
     def __init__(self, client: Client, cameras: Sequence[str], board: AnyBoard) -> None:
         self._client, self._cameras, self._board = client, tuple(cameras), board
-        self._pool = ThreadPoolExecutor(2, "bench-corners")
         status = client.status()
         rig = parse_rig(client.mast_file(), "the daemon's mast file").rig
         rig = replace(
@@ -174,12 +188,7 @@ class DaemonMast:
         )
         one_sided = bool(axes) and all(axis["one_sided"] for axis in axes.values())
         count_rad = max((float(axis["count_rad"] or 0.0) for axis in axes.values()), default=0.0)
-        self._head = BenchHead(rig, pan_rad, tilt_rad, one_sided, count_rad)
-
-    @property
-    def head(self) -> BenchHead:
-        """What is known of it."""
-        return self._head
+        self.head = BenchHead(rig, pan_rad, tilt_rad, one_sided, count_rad)
 
     def look(
         self,
@@ -188,11 +197,7 @@ class DaemonMast:
         approach: tuple[int, int] = (0, 0),
         cameras: Collection[str] | None = None,
     ) -> BenchLook:
-        """See `BenchMast`.
-
-        Raises BenchInterrupted if another client steers, a stop was pressed, the daemon is gone, or head or
-        cameras fail for longer than a cable takes to be put back.
-        """
+        """See `BenchMast`."""
         begun = time.monotonic()
         while True:
             try:
@@ -200,44 +205,40 @@ class DaemonMast:
             except ClientError as error:
                 if error.code in ("outside_limits", "keep_out", "sun", "unreachable"):
                     raise NotThere(str(error)) from None
-                waited_s = time.monotonic() - begun
+                detail, waited_s = error.detail or {}, time.monotonic() - begun
                 if _unlit(error) and waited_s > min(ADJUSTING_S, PATIENCE_S):
-                    raise NoLight(self._reason(error)) from None
+                    more = "; turn on a light, or let the camera expose longer"
+                    raise NoLight(f"{error}{more if detail['light'] == 'dark' else ''}") from None
                 if error.code in LASTING or waited_s > PATIENCE_S:
-                    raise BenchInterrupted(self._reason(error)) from None
+                    raise BenchInterrupted(str(detail.get("how", error))) from None
                 time.sleep(AGAIN_S)
 
     def _look(
         self, pan_rad: float, tilt_rad: float, approach: tuple[int, int], cameras: Collection[str] | None
     ) -> BenchLook:
-        names = [name for name in self._cameras if cameras is None or name in cameras]
-        begun_s = self._now_s()
         self._turn(pan_rad, tilt_rad, approach)
-        shots: dict[str, Snapshot] = {}
-        failed: dict[str, ClientError] = {}
-        found: dict[str, Future[SeenBoard]] = {}
-        for name in names:
+        shots: list[Snapshot] = []
+        failed: list[ClientError] = []
+        seen: list[SeenBoard] = []
+        for name in self._cameras:
+            if cameras is not None and name not in cameras:
+                continue
             try:
-                shots[name] = self._client.snapshot(name)
+                shots.append(self._client.snapshot(name))
+                seen.append(self._seen(shots[-1]))
             except ClientError as error:
-                failed[name] = error
                 if error.code in LASTING:
                     raise
-            else:  # its corners are found while the next one is taken
-                found[name] = self._pool.submit(self._seen, shots[name])
+                failed.append(error)
+                reason = str(error).removeprefix(f"{name}: ") if _unlit(error) else ""
+                seen.append(SeenBoard(name, None, reason or f"camera {name} gave no picture"))
         if not shots:
-            raise max(failed.values(), key=_unlit)
-        seconds = self._now_s() - begun_s
-        if any(shot.moving for shot in shots.values()):
+            raise max(failed, key=_unlit)
+        if any(shot.moving for shot in shots):
             raise ClientError("moving", "the head moved while the pictures were taken")
-        seen = tuple(
-            found[name].result() if name in found else SeenBoard(name, None, _no_picture(name, failed[name]))
-            for name in names
-        )
-        pan_rad, tilt_rad = np.mean([(one.pan_rad, one.tilt_rad) for one in shots.values()], axis=0).tolist()
-        one = next(iter(shots.values()))
-        sides = _side(one.pan_approach), _side(one.tilt_approach)
-        return BenchLook(seen, pan_rad, tilt_rad, *sides, seconds)
+        pan_rad, tilt_rad = np.mean([(one.pan_rad, one.tilt_rad) for one in shots], axis=0).tolist()
+        sides = _side(shots[0].pan_approach), _side(shots[0].tilt_approach)
+        return BenchLook(tuple(seen), pan_rad, tilt_rad, *sides)
 
     def _turn(self, pan_rad: float, tilt_rad: float, approach: tuple[int, int]) -> None:
         """Go to readings, by way of ones beside them where an axis would come from the other side.
@@ -245,7 +246,7 @@ class DaemonMast:
         A head that comes from either side goes through all of its play, so that it is known where in it it
         rests.
         """
-        wanted, head = (pan_rad, tilt_rad), self._head
+        wanted, head = (pan_rad, tilt_rad), self.head
         if not head.one_sided:
             joints: Mapping[str, Any] = self._client.status()["joints"] or {}
             now = (float(joints.get("pan_rad", pan_rad)), float(joints.get("tilt_rad", tilt_rad)))
@@ -261,45 +262,104 @@ class DaemonMast:
         error: Mapping[str, Any] = operation.get("error") or {}
         reason = str(error.get("message", "the move failed"))
         if operation["state"] == "stopped":
-            raise BenchInterrupted(
-                f"the head was stopped in the middle of a move: {reason}{self._how_to_go_on()}"
-            )
+            raise BenchInterrupted(f"the head was stopped in the middle of a move: {reason}")
         if operation["state"] != "done":
             raise ClientError(str(error.get("code", "failed")), reason)
-
-    def _how_to_go_on(self) -> str:
-        """What releases the head, as the end of a sentence; empty if no emergency stop is latched."""
-        with suppress(ClientError):
-            if self._client.status()["estop"] is not None:
-                return "; 'mastctl reset' releases it"
-        return ""
-
-    def _reason(self, error: ClientError) -> str:
-        """A daemon's refusal as what a person has to do about it."""
-        detail = error.detail or {}
-        if error.code == "leased":
-            return f"another client steers the head: {error}"
-        if error.code == "estopped":
-            return f"the emergency stop is latched ('mastctl reset' releases it): {error}"
-        if error.code == "lease_over" and "how" in detail:
-            return f"{detail['how']}{self._how_to_go_on()}"
-        if detail.get("light") == "dark":
-            return f"{error}; turn on a light, or let the camera expose longer"
-        return str(error)
 
     def _seen(self, shot: Snapshot) -> SeenBoard:
         found = find_corners(self._board, shot.image)
         if isinstance(found, CornersNotFound):
-            corners, reason = None, _why(shot.image, found.reason)
-        elif len(found) < FEWEST_CORNERS:
+            return SeenBoard(shot.camera, None, found.reason)
+        if len(found) < FEWEST_CORNERS:
             reason = f"{len(found)} corners of the board where {FEWEST_CORNERS} at least are expected"
-            corners = None
-        else:
-            corners, reason = found, ""
-        return SeenBoard(shot.camera, corners, reason, shot.data)
+            return SeenBoard(shot.camera, None, reason)
+        return SeenBoard(shot.camera, found, "", shot.data)
 
-    def _now_s(self) -> float:
-        return float(self._client.status()["now_s"])
+
+def find_board(
+    mast: BenchMast, known: Knowledge, sought: Sought, say: Callable[[str], None], placement: Placement
+) -> BenchLook:
+    """Return the first look that shows the board: where it should stand, then ever further around it.
+
+    Views without light or with nothing in them end nothing: the board may stand beside them. Raises
+    BenchInterrupted ``board_not_found`` with what the images showed instead, and where.
+    """
+    on_head = {name for name, camera in known.rig.cameras.items() if camera.on == "head"}
+    attitudes = list(_attitudes(known.rig, sought, placement))
+    instead: dict[str, list[str]] = {}
+    looks, most, where = 0, min(len(attitudes), MOST_LOOKS), "all over the head's limits"
+    for at_rad in attitudes:
+        try:
+            look = mast.look(*at_rad)
+        except NotThere as error:
+            reasons = [str(error)]
+        except NoLight as error:
+            reasons, looks = [str(error).partition("; ")[0]], looks + 1
+        else:
+            if any(one.camera in on_head for one in look.found):
+                return look
+            reasons, looks = [one.why for one in look.seen if one.why], looks + 1
+        pan, tilt = map(math.degrees, at_rad)
+        for reason in dict.fromkeys(reasons):
+            # The same with other numbers is the same.
+            first = next((one for one in instead if _plain(one) == _plain(reason)), reason)
+            instead.setdefault(first, []).append(f"pan {pan:+.0f}, tilt {tilt:+.0f} degrees")
+        if most > looks + LOOKS_BESIDE and any(part in reason for part in ANOTHER for reason in reasons):
+            most = looks + LOOKS_BESIDE
+        if looks == 1:
+            say(
+                f"the board is not where it was requested ({_summary(instead)}); looking around, {most - 1} "
+                "looks at most"
+            )
+        if looks == most < len(attitudes):
+            where = "around where it was requested"
+            break
+    raise BenchInterrupted(
+        f"the board was not found in {looks} look{'s' * (looks != 1)} {where} ({_summary(instead)}); place "
+        "it as requested, in the light, facing the head, and go on with the run",
+        "board_not_found",
+    )
+
+
+def _attitudes(rig: Rig, sought: Sought, placement: Placement) -> Iterator[tuple[float, float]]:
+    """Where the board should be, then a grid of the limits from there outwards."""
+    model = next(c.model for c in rig.cameras.values() if c.on == "head")
+    limits = sought.pan_limits_rad, sought.tilt_limits_rad
+    middle = placement.rover_from_board(rig.mast.rover_from_head(0.0, 0.0)).translation_m
+    try:
+        start = readings(rig, sought, model, middle)
+    except (Unreachable, CalibError, ValueError):
+        towards = math.radians(placement.bearing_deg), math.radians(placement.height_deg)
+        pan_rad, tilt_rad = (float(np.clip(one, *limit)) for one, limit in zip(towards, limits, strict=True))
+        start = pan_rad, tilt_rad
+    yield start
+    halves = np.array(model.size_px) / (2.0 * np.linalg.norm((model.H, model.V), axis=1))
+    steps = 2.0 * OVERLAP * np.arctan(halves)
+    pans, tilts = (
+        np.clip(
+            at + np.arange(-math.ceil((at - low) / step), math.ceil((high - at) / step) + 1) * step, low, high
+        )
+        for at, step, (low, high) in zip(start, steps, limits, strict=True)
+    )
+    grid = sorted(set(product(pans.tolist(), tilts.tolist())) - {start})
+    away = (np.abs(np.reshape(grid, (-1, 2)) - start) / steps).max(axis=1)
+    yield from (grid[k] for k in np.argsort(away, kind="stable"))
+
+
+def _summary(instead: Mapping[str, Sequence[str]]) -> str:
+    """What was seen, how often and where first: another board first, then what most views showed."""
+    found = sorted(instead.items(), key=lambda one: (not any(p in one[0] for p in ANOTHER), -len(one[1])))
+    more = [f"{len(found) - MOST_KINDS} other reasons"] if len(found) > MOST_KINDS else []
+    shown = [
+        f"{reason}, {len(places)} time{'s' * (len(places) > 1)}, first at {places[0]}"
+        for reason, places in found[:MOST_KINDS]
+    ]
+    return "; ".join([*shown, *more]) or "no corners were found"
+
+
+def _plain(reason: str) -> str:
+    """A reason without its numbers."""
+    return re.sub(r"[-+]?[0-9][0-9.]*", "", reason)
 
 
 class SimulatedBoard:
@@ -353,16 +413,3 @@ def _side(approach: float) -> int:
 def _unlit(error: ClientError) -> bool:
     """Whether a daemon refused a picture for its light."""
     return (error.detail or {}).get("light") is not None
-
-
-def _no_picture(camera: str, error: ClientError) -> str:
-    """Why there is no picture of a camera beside another one's."""
-    return str(error).removeprefix(f"{camera}: ") if _unlit(error) else f"camera {camera} gave no picture"
-
-
-def _why(image: Any, reason: str) -> str:
-    """Why a picture shows no board: its light, if that is to blame."""
-    mean = float(np.mean(image))
-    if DARK_DN <= mean <= BRIGHT_DN:
-        return reason
-    return f"too {'dark' if mean < DARK_DN else 'bright'}, mean grey level {mean:.0f} of 255"

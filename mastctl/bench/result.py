@@ -32,8 +32,8 @@ class BenchDone:
 
     ``checked``: measured at the end, None of a folder that was fitted again. ``predicted_px``,
     ``calibrated_px``, ``counts_px``: rms per axis of a first pointing, as expected when pictures sufficed, by
-    the calibration's own covariance, and by counts alone. ``seconds`` are the rover's; ``pictures`` of the
-    camera with most; ``page``: the report.
+    the calibration's own covariance, and by counts alone. ``pictures`` of the camera with most; ``page``: the
+    report.
     """
 
     survey: Survey
@@ -47,7 +47,6 @@ class BenchDone:
     predicted_px: float | None = None
     calibrated_px: float | None = None
     counts_px: float | None = None
-    seconds: float | None = None
     placements: int = 0
     pictures: int = 0
     page: Path | None = None
@@ -69,7 +68,6 @@ class BenchDone:
             "gauges": list(fit.gauges),
             "outliers": [outlier.sentence for outlier in fit.outliers],
             "survey": {"folder": str(self.survey.folder), "digest": self.survey.digest},
-            "rover_seconds": self.seconds,
             **picked(
                 self, "coverage", "placements", "pictures", "predicted_px", "calibrated_px", "counts_px"
             ),
@@ -127,7 +125,6 @@ def finish(bench: BenchRun, reporter: Reporter, out: Path, report: Path | None) 
     numbers = {
         "predicted_px": known.predicted_px(),
         "counts_px": known.counts_px,
-        "seconds": known.kept.seconds(),
         "placements": len(known.placements()),
         "pictures": known.pictures(),
     }
@@ -223,12 +220,7 @@ def _worth(checked: Checked | None, numbers: Mapping[str, Any]) -> Iterator[tupl
             f"pointed at {len(checked.pointings)} corners, rms x and y",
             f"{x:.2f}, {y:.2f} px, promised {promised:.2f}",
         )
-    if "seconds" in numbers:
-        yield (
-            "taken",
-            f"{numbers['placements']} placements, {numbers['pictures']} pictures a camera, "
-            f"{numbers['seconds']:.0f} s of the rover's time",
-        )
+    yield "taken", f"{numbers['placements']} placements, {numbers['pictures']} pictures a camera"
 
 
 def _pointings(checked: Checked | None) -> Table | None:

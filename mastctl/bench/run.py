@@ -32,8 +32,8 @@ from mastctl.bench.mast import (
     DaemonMast,
     NotThere,
     SimulatedBoard,
+    find_board,
 )
-from mastctl.bench.search import find_board
 from mastctl.bench.survey import RunFolder
 from mastctl.client import Client
 from mastctl.errors import MastctlError
@@ -117,21 +117,17 @@ class BenchRun:
         placement already if something changed that no more pictures mend.
         """
         known = self.known
-        try:
-            self._take_up()
-            while not self._enough():
-                name, placement = self._next_placement()
-                self._reporter.place(name, placement)
-                if self._simulated is not None:
-                    self._simulated.stand(placement)
-                self._kept.note(event="placement", name=name, requested=asdict(placement))
-                self._reporter.step("search")
-                found = find_board(self._mast, known.now, known.sought, self._reporter.say, placement)
-                known.take(name, found)
-                self._work_at(name)
-            return known.fit()
-        finally:
-            known.end()
+        self._take_up()
+        while not self._enough():
+            name, placement = self._next_placement()
+            self._reporter.place(name, placement)
+            if self._simulated is not None:
+                self._simulated.stand(placement)
+            self._kept.note(event="placement", name=name, requested=asdict(placement))
+            self._reporter.step("search")
+            known.take(name, find_board(self._mast, known.now, known.sought, self._reporter.say, placement))
+            self._work_at(name)
+        return known.fit()
 
     def check(self) -> Checked:
         """Capture images that are not fitted, and point at corners, where the board stands now.
@@ -153,7 +149,11 @@ class BenchRun:
         checks = known.of(name, check=True)
         pointings = []
         for pointing in point_at_corners(self._mast, known, name, checks):
-            self._reporter.say(pointing.sentence())
+            x, y = pointing.residual_px
+            self._reporter.say(
+                f"pointed at corner {pointing.corner}, {pointing.turned_deg:.0f} degrees off: residual "
+                f"{x:+.2f}, {y:+.2f} px (promised {pointing.promised_px:.2f})"
+            )
             pointings.append(pointing)
         return Checked(known.promised_px(checks, name), tuple(pointings))
 
@@ -183,7 +183,7 @@ class BenchRun:
             self._reporter.say(
                 f"the board does not stand any more as in placement {name}: that one is closed"
             )
-            self._kept.note(event="closed", name=name)
+            self._kept.note(event="done", name=name)
 
     def _enough(self) -> bool:
         known = self.known
@@ -237,7 +237,6 @@ class BenchRun:
         missed = 0
         while True:
             taken = len(known.of(name))
-            known.collect()
             ahead = max(FEWEST_LOOKS - taken, 1)
             choice = next_shot(known.now, known.sought, known.shots, name, known.aim, in_vain, ahead)
             if choice is None or taken >= most or self._suffices(taken, choice):
@@ -258,7 +257,7 @@ class BenchRun:
             if missed >= UNSEEN_IN_A_ROW:
                 raise BenchInterrupted(
                     f"the board of placement {name} was not seen in {missed} looks in a row where it stood "
-                    f"({reason}). Put it back or place it anew, and start the same command again",
+                    f"({reason}). Put it back or place it anew, and go on with the run",
                     "board_lost",
                 )
         for shot in known.round_others(name):
@@ -302,21 +301,11 @@ class BenchRun:
         return choice.expected_px > (1.0 - (LAST_GAIN if last else LITTLE_GAIN)) * now_px
 
     def _end(self, name: str) -> None:
-        """Capture once more where the placement began: did the board, or the head, stay as it was?"""
+        """Capture once more where the placement began: the fit shows whether board and head stayed there."""
         known = self.known
-        then = known.of(name)[0]
-        now = self._again(then)
-        apart_px = corners_apart_px(then, now)
-        camera = known.head.rig.cameras[known.workspace.cameras[0]].model
-        # Two readings may differ by counts.
-        allowed_px = MOVED_PX + 3.0 * known.head.count_rad * float(np.linalg.norm(camera.H))
-        if apart_px is not None and apart_px > allowed_px:
-            self._reporter.say(
-                f"placement {name}: its first picture taken again shows the board {apart_px:.1f} px aside: "
-                "the board or the head moved meanwhile; the fit will show which, and when"
-            )
-            self._kept.note(event="moved", name=name, apart_px=round(apart_px, 2))
-            known.take(name, now)  # one more picture of how it is now
+        again = self._again(known.of(name)[0])
+        if again.found:
+            known.take(name, again)
         self._kept.note(event="done", name=name)
 
     def _report(self, choice: AttitudeChoice | None) -> None:

@@ -115,7 +115,6 @@ class RunFolder:
             )
             self._folder.append(image, one.corners, one.data or None)
         self._numbers[placement] = number
-        self.note(event="look", placement=placement, number=number, seconds=round(look.seconds, 3))
 
     def requested(self, name: str) -> Placement | None:
         """Return where a placement was requested; None if it was not, or a kill cut it short."""
@@ -127,13 +126,7 @@ class RunFolder:
 
     def is_over(self, name: str) -> bool:
         """Return whether a placement was ended."""
-        return any(
-            note.get("name") == name and note.get("event") in ("closed", "done") for note in self.notes
-        )
-
-    def seconds(self) -> float:
-        """Return how long all looks took, seconds of the rover's clock."""
-        return sum(float(note.get("seconds", 0.0)) for note in self.notes)
+        return any(note.get("name") == name and note.get("event") == "done" for note in self.notes)
 
 
 def _locked(path: Path) -> int:

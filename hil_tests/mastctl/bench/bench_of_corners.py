@@ -111,7 +111,7 @@ class CornerBench:
         self.pictures += len(names)
         seen = [self._seen(name, true_rad) for name in names]
         read = self.pan.read_rad, self.tilt.read_rad
-        return BenchLook(tuple(seen), *read, self._side(self.pan), self._side(self.tilt), seconds)
+        return BenchLook(tuple(seen), *read, self._side(self.pan), self._side(self.tilt))
 
     def _side(self, axis: TrueAxis) -> int:
         return 0 if axis.one_sided else axis.side

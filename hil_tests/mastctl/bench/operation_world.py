@@ -49,7 +49,7 @@ DONE = {
             "promised_px": {"navcam_left": 0.09}, "pointings": [], "pointing_rms_px": [0.1, 0.2],
             "pointing_promised_px": 0.15,
         },
-        "calibrated_px": 0.1, "counts_px": 0.03, "pictures": 18, "placements": 2, "rover_seconds": 35.0,
+        "calibrated_px": 0.1, "counts_px": 0.03, "pictures": 18, "placements": 2,
     },
 }  # fmt: skip
 

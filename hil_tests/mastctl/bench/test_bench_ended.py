@@ -26,9 +26,8 @@ from hil_tests.mastctl.bench.bench_of_corners import CornerBench
 from hil_tests.mastctl.bench.bench_world import corner_bench, run_of
 from hil_tests.mastctl.outside_daemon import write_config
 from hil_tests.mastctl.service_fakes import FakeHardware
-from mastctl.bench.mast import BenchInterrupted, BenchLook, NoLight
+from mastctl.bench.mast import BenchInterrupted, BenchLook, NoLight, find_board
 from mastctl.bench.run import BenchRun
-from mastctl.bench.search import find_board
 from mastctl.bench.survey import looks_of
 from mastctl.cli import calibrate_bench
 from mastctl.cli.main import main

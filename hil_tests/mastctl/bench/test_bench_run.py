@@ -71,7 +71,6 @@ def test_a_camera_that_can_show_nothing_new_takes_no_picture(repository: Path, t
         tilts = [look.tilt_rad for look in known.of("p1") if pancam in {one.camera for one in look.found}]
         assert len(tilts) >= 4 and np.ptp(tilts) > np.radians(11.0), "what a fit of its place needs"
     assert not list(known.round_others("p1"))
-    known.end()
     known.fitted = object()  # type: ignore[assignment]  # the estimate is good now
     assert set(run.look_at(beside).cameras) == navcams, "it is beside the narrow view"
     assert set(run.look_at(at_it, check=True).cameras) == set(every), "a check is of each of them"

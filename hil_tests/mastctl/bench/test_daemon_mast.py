@@ -57,7 +57,7 @@ def test_a_look_shows_the_board_with_one_reading_and_describes_the_head(mast: Da
     assert kept["navcam_left"].sensor_mode == whole
     look = mast.look(0.05, -0.02)
     assert [one.camera for one in look.found] == list(CAMERAS)
-    assert look.pan_rad == pytest.approx(0.05, abs=1e-4) and look.seconds > 0.0
+    assert look.pan_rad == pytest.approx(0.05, abs=1e-4)
     assert all(one.corners is not None and len(one.corners) > 20 and one.data for one in look.found)
     assert mast.look(0.05, -0.02, cameras=CAMERAS[1:]).cameras == CAMERAS[1:]
 

@@ -1,7 +1,7 @@
 // A bench calibration, step by step: where the board goes, how far it is, and what came of it.
 import { byId, h, put, say } from "./dom.js";
 import { ask, fileOf, get, held, post } from "./api.js";
-import { camera as called, deg, forTime, number, sentence } from "./words.js";
+import { camera as called, deg, number, sentence } from "./words.js";
 import { asSeen, coverage, curve, fromAbove } from "./bench_drawn.js";
 
 const STEPS = [["place", "Place the board"], ["search", "Look for it"], ["pictures", "Take pictures"], ["check", "Check"], ["fit", "Fit"], ["over", "Verdict"]];
@@ -208,7 +208,7 @@ export class Bench {
         head("rms x, y, px", "fitted", "not fitted", "promised"),
         Object.entries(result.rms_px).map(([name, rms]) => h("tr", {}, h("th", { scope: "row" }, called(name)), cell(two(rms)), cell(two(result.check_rms_px[name])), cell(short(check.promised_px[name])))),
         h("tr", {}, h("th", { scope: "row" }, `pointing at ${check.pointings.length} corners`), cell(""), cell(two(check.pointing_rms_px)), cell(short(check.pointing_promised_px)))),
-      h("p", { class: "quiet" }, `A first pointing is left ${px(result.calibrated_px)} by the calibration, ${px(result.counts_px)} by the encoders' counts alone. ${result.placements} placements, ${result.pictures} pictures a camera, ${result.rover_seconds === null ? "" : `${forTime(result.rover_seconds)} of the rover's time`}.`),
+      h("p", { class: "quiet" }, `A first pointing is left ${px(result.calibrated_px)} by the calibration, ${px(result.counts_px)} by the encoders' counts alone. ${result.placements} placements, ${result.pictures} pictures a camera.`),
       h("div", { class: "buttons" },
         h("button", { type: "button", class: "go", id: "bench-use", disabled: !this.may || using, onclick: () => this.use(run.mast_file) }, using ? "This mast file is in use" : "Use this mast file"),
         run.report ? this.link(run.report, "Read the report") : null),
