@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import math
-import threading
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
@@ -229,19 +228,21 @@ class KeepOutJudge:
     ) -> None:
         self.limits = limits
         self._clock = clock
-        self._device = device
         self.axes: Mapping[str, AxisMotion] = head.info.motion
+        _check_acceleration(limits.acceleration_rad_per_s2, self.axes, device)
+        self._braking_rad_per_s2 = min(
+            (axis.acceleration_rad_per_s2 for axis in self.axes.values()),
+            default=limits.acceleration_rad_per_s2 or ASSUMED_RAD_PER_S2,
+        )
         still = AxisMotion(ASSUMED_RAD_PER_S2)
         pan, tilt = (self.axes.get(axis, still).beyond_goal_rad for axis in ("pan", "tilt"))
         self._beyond = pan, tilt
-        self._lock = threading.Lock()
-        self._rig = rig
+        self._rig = rig  # this and the next two: replaced, never edited
         self._sun = sun
         self._rover_from_site = np.eye(3)
-        self._sun_boxes: tuple[Box, ...] = ()
+        self._made: tuple[tuple[object, ...], KeepOuts] | None = None  # of which rig, sun and rover
         self._sent: _SentMove | None = None
         self._inside_s: Mapping[str, float] = {}  # where the head stands and should not, and since when
-        self.use_limits(limits)
 
     @property
     def counts_rad(self) -> Mapping[str, float]:
@@ -260,37 +261,17 @@ class KeepOutJudge:
         """Return how far an axis goes while it brakes from a speed."""
         return speed_rad_per_s**2 / (2.0 * self._braking_rad_per_s2)
 
-    def use_limits(self, limits: Limits) -> None:
-        """Let moves go out within other limits and keep-outs; a head that is outside may go back in.
-
-        Raises BadOptions if the head states that it speeds up faster than these allow; nothing has changed.
-        """
-        _check_acceleration(limits, self.axes, self._device)
-        assumed = limits.acceleration_rad_per_s2 or ASSUMED_RAD_PER_S2
-        with self._lock:
-            self.limits = limits
-            self._braking_rad_per_s2 = min(
-                (axis.acceleration_rad_per_s2 for axis in self.axes.values()), default=assumed
-            )
-            self._renew()
-
     def use_rig(self, rig: Rig) -> None:
         """Judge the sun by another mast file's cameras."""
-        with self._lock:
-            self._rig = rig
-            self._renew()
+        self._rig = rig
 
     def use_sun(self, sun: SunDirection | None) -> None:
         """Keep another direction out, or none."""
-        with self._lock:
-            self._sun = sun
-            self._renew()
+        self._sun = sun
 
     def rover_stands(self, rover_from_site: FloatArray) -> None:
         """Turn a sun of the site frame with the rover, (3, 3)."""
-        with self._lock:
-            self._rover_from_site = rover_from_site
-            self._renew()
+        self._rover_from_site = rover_from_site
 
     def check_goal(self, pan_rad: float, tilt_rad: float) -> None:
         """Pass joint angles that may be a goal. Raises OutsideLimits, KeptOut."""
@@ -303,7 +284,7 @@ class KeepOutJudge:
         Raises OutsideLimits; KeptOut, which names the nearest free goal.
         """
         self.limits.check(*goal)
-        self._now().refuse_unless_free(Span.around(start), goal, True)
+        self._now().check_move(Span.around(start), goal, True)
 
     def free_span(self, place: Pair) -> Span | None:
         """Return a free rectangle within the limits about a place, moved into them; None if kept out."""
@@ -320,7 +301,7 @@ class KeepOutJudge:
         if not keep_outs.boxes:
             return None
         start, rests = self._start(read())
-        keep_outs.refuse_unless_free(start, goal, rests)
+        keep_outs.check_move(start, goal, rests)
         return start
 
     def sent(self, start: Span | None, goal: Pair, speed_rad_per_s: float) -> None:
@@ -403,7 +384,7 @@ class KeepOutJudge:
         if sun is None:
             return {"sun": None, "boxes": []}
         x, y, z = sun.direction
-        boxes = self._sun_boxes if sun.holds(now_s) else ()
+        boxes = self._sun_boxes(self._rig, sun, self._rover_from_site) if sun.holds(now_s) else []
         return {
             "boxes": [
                 {"name": box.name, "pan_rad": list(box.pan_rad), "tilt_rad": list(box.tilt_rad)}
@@ -437,33 +418,34 @@ class KeepOutJudge:
         return Span.around(goal).grown(self._beyond[0], self._beyond[1])
 
     def _now(self) -> KeepOuts:
-        """What is kept out at this moment."""
-        sun = self._sun
-        return self._boxes[sun is not None and sun.holds(self._clock.now_s())]
+        """What is kept out at this moment; made anew when mast file, sun or rover have changed."""
+        sun = self._sun if self._sun is not None and self._sun.holds(self._clock.now_s()) else None
+        of = self._rig, sun, self._rover_from_site
+        made = self._made
+        if made is None or any(one is not other for one, other in zip(made[0], of, strict=True)):
+            limits = self.limits
+            # A copy of each box for every turn that the pan reaches, and for where a hand may have pushed it.
+            reach = limits.pan_rad[0] - np.pi, limits.pan_rad[1] + np.pi
+            boxes = (*limits.keep_out, *self._sun_boxes(*of))
+            copies = tuple(copy for box in boxes for copy in box.within(reach))
+            kept_out = KeepOuts(copies, limits.margin_rad, self._beyond, limits.pan_rad, limits.tilt_rad)
+            made = self._made = of, kept_out
+        return made[1]
 
-    def _renew(self) -> None:
-        """Make the boxes anew; the lock is kept."""
-        limits, sun = self.limits, self._sun
-        slack = limits.margin_rad + self._beyond[1]
-        # A copy of each box for every turn that the pan reaches, and for where a hand may have pushed it.
-        reach = limits.pan_rad[0] - np.pi, limits.pan_rad[1] + np.pi
-        plain: list[Box] = [copy for box in limits.keep_out for copy in box.within(reach)]
-        with_sun = list(plain)
-        self._sun_boxes = ()
-        if sun is not None and self._rig is not None:
-            direction = np.array(sun.direction)
-            in_rover = direction if sun.frame == "rover" else self._rover_from_site @ direction
-            tilts = limits.tilt_rad[0] - slack, limits.tilt_rad[1] + slack
-            joints = self._rig.joints
-            true_tilts = joints.tilt.true_rad(tilts[0], 1.0), joints.tilt.true_rad(tilts[1], -1.0)
-            rows = [
-                Box(box.name, _as_read(joints.pan, box.pan_rad), _as_read(joints.tilt, box.tilt_rad))
-                for box in sun_boxes(self._rig, in_rover, sun.half_angle_rad, true_tilts)
-            ]
-            self._sun_boxes = tuple(rows)
-            with_sun += [copy for box in rows for copy in box.within(reach)]
-        within = limits.margin_rad, self._beyond, limits.pan_rad, limits.tilt_rad
-        self._boxes = [KeepOuts(tuple(boxes), *within) for boxes in (plain, with_sun)]
+    def _sun_boxes(self, rig: Rig | None, sun: SunDirection | None, rover_from_site: FloatArray) -> list[Box]:
+        """The sun's cone as boxes of what the head reads there."""
+        if sun is None or rig is None:
+            return []
+        direction = np.array(sun.direction)
+        in_rover = direction if sun.frame == "rover" else rover_from_site @ direction
+        slack = self.limits.margin_rad + self._beyond[1]
+        low, high = self.limits.tilt_rad[0] - slack, self.limits.tilt_rad[1] + slack
+        pan, tilt = rig.joints.pan, rig.joints.tilt
+        true_tilts = tilt.true_rad(low, 1.0), tilt.true_rad(high, -1.0)
+        return [
+            Box(box.name, _as_read(pan, box.pan_rad), _as_read(tilt, box.tilt_rad))
+            for box in sun_boxes(rig, in_rover, sun.half_angle_rad, true_tilts)
+        ]
 
 
 def _into(value: float, limits: Pair) -> float:
@@ -475,9 +457,8 @@ def _as_read(joint: AxisJoint, true_rad: Pair) -> Pair:
     return joint.read_rad(true_rad[0], -1.0), joint.read_rad(true_rad[1], 1.0)
 
 
-def _check_acceleration(limits: Limits, stated: Mapping[str, AxisMotion], device: str) -> None:
+def _check_acceleration(most: float | None, stated: Mapping[str, AxisMotion], device: str) -> None:
     """Pass a head that speeds up no faster than the limits allow. Raises BadOptions."""
-    most = limits.acceleration_rad_per_s2
     if most is None:
         return
     if not stated:

@@ -126,7 +126,7 @@ class KeepOuts:
 
     @cached_property
     def full(self) -> tuple[Span, ...]:
-        """Every box with the room that goals keep."""
+        """Every box, grown by the slack."""
         return tuple(box.span.grown(*self.slack_rad) for box in self.boxes)
 
     def holding(self, place: Span) -> list[Box]:
@@ -135,11 +135,28 @@ class KeepOuts:
 
     def check_goal(self, goal: Pair) -> None:
         """Pass a goal that lies in no box nor too near to one. Raises KeptOut."""
-        point = Span.around(goal)
-        for box, full in zip(self.boxes, self.full, strict=True):
-            if point.enters(full):
-                where = "in" if point.enters(box.span) else "too near to"
-                raise KeptOut(box.name, f"{_text(goal)} is {where} the {box}{self._slack_text()}")
+        refusal = self._goal_refusal(goal)
+        if refusal is not None:
+            raise refusal
+
+    def check_move(self, start: Span, goal: Pair, rests: bool) -> None:
+        """Pass a move from anywhere in ``start`` to a goal.
+
+        A head in the margin of a box may go where that is not nearer. One in a box itself may leave it the
+        shortest way along one axis, from rest. Raises KeptOut, with the nearest free goal, if any place that
+        the head may pass is kept out.
+        """
+        refusal = self._refusal(start, goal, rests)
+        if refusal is not None:
+            nearest = self.nearest_free(start, goal, rests)
+            advice = "from there no goal is free"
+            if nearest is not None:
+                advice = f"the nearest goal that is free from there is {_text(nearest)}"
+            raise KeptOut(refusal.name, f"{refusal}; {advice}", nearest)
+
+    def allows(self, start: Span, goal: Pair, rests: bool) -> bool:
+        """Return whether `check_move` passes a move."""
+        return self._refusal(start, goal, rests) is None
 
     def free_span(self, place: Pair, most: Span) -> Span | None:
         """Return ``most``, shrunk evenly towards a place in it until no keep-out reaches into it, or None."""
@@ -154,46 +171,6 @@ class KeepOuts:
             span = Span((left, right), (low, high))
         return None
 
-    def near(self, start: Span) -> tuple[Span, ...]:
-        """Return every box with as much of its margin as a start leaves: nearer than it is, nothing goes."""
-        rooms = [min(self.margin_rad, max(0.0, start.gap(box.span))) for box in self.boxes]
-        return tuple(box.span.grown(room, room) for box, room in zip(self.boxes, rooms, strict=True))
-
-    def reach(self, start: Span, goal: Pair) -> Span:
-        """Return all that a move from anywhere in ``start`` to a goal may pass."""
-        return Span.around(*start.corners, *Span.around(goal).grown(*self.beyond_rad).corners)
-
-    def check_move(self, start: Span, goal: Pair, rests: bool) -> None:
-        """Pass a move from anywhere in ``start`` to a goal. Raises KeptOut if any place that it may pass is.
-
-        A head in the margin of a box may go where that is not nearer. One in a box itself may leave it the
-        shortest way along one axis, from rest.
-        """
-        self.check_goal(goal)
-        inside = self.holding(start)
-        if inside:
-            self._check_way_out(start, goal, rests, inside[0])
-            return
-        way = self.reach(start, goal)
-        for box, near in zip(self.boxes, self.near(start), strict=True):
-            if way.enters(near):
-                raise KeptOut(
-                    box.name,
-                    f"between {_text(_middle(start))} and {_text(goal)} the head may pass the {box}"
-                    f"{self._slack_text()}: each axis goes at its own pace",
-                )
-
-    def refuse_unless_free(self, start: Span, goal: Pair, rests: bool) -> None:
-        """Pass what `check_move` passes. Raises KeptOut with the nearest free goal in its message."""
-        try:
-            self.check_move(start, goal, rests)
-        except KeptOut as refused:
-            nearest = self.nearest_free(start, goal, rests)
-            advice = "from there no goal is free"
-            if nearest is not None:
-                advice = f"the nearest goal that is free from there is {_text(nearest)}"
-            raise KeptOut(refused.name, f"{refused}; {advice}", nearest) from None
-
     def nearest_free(self, start: Span, goal: Pair, rests: bool) -> Pair | None:
         """Return the goal nearest to a refused one to which the head may go from a start; None if none.
 
@@ -207,7 +184,7 @@ class KeepOuts:
             past = self.beyond_rad[axis]
             edges = {middle[axis], min(max(goal[axis], limits[0]), limits[1]), *limits}
             edges |= {edge for full in self.full for edge in (full.pan_rad, full.tilt_rad)[axis]}
-            for near in self.near(start):
+            for near in self._near(start):
                 low, high = (near.pan_rad, near.tilt_rad)[axis]
                 edges |= {low - past, high + past}
             if out is not None:
@@ -216,14 +193,6 @@ class KeepOuts:
         places = ((pan, tilt) for pan in lines[0] for tilt in lines[1])
         by_distance = sorted(places, key=lambda one: (math.dist(one, goal), one))
         return next((one for one in by_distance if self.allows(start, one, rests)), None)
-
-    def allows(self, start: Span, goal: Pair, rests: bool) -> bool:
-        """Return whether `check_move` passes a move."""
-        try:
-            self.check_move(start, goal, rests)
-        except KeptOut:
-            return False
-        return True
 
     def way_out(self, place: Pair) -> Pair | None:
         """Return where the shortest way along one axis leaves the boxes that hold the head.
@@ -254,24 +223,51 @@ class KeepOuts:
             end = (edge, end[1]) if axis == 0 else (end[0], edge)
         return None
 
-    def _check_way_out(self, start: Span, goal: Pair, rests: bool, box: Box) -> None:
-        """Pass a move out of the box that holds the head. Raises KeptOut."""
+    def _goal_refusal(self, goal: Pair) -> KeptOut | None:
+        point = Span.around(goal)
+        for box, full in zip(self.boxes, self.full, strict=True):
+            if point.enters(full):
+                where = "in" if point.enters(box.span) else "too near to"
+                return KeptOut(box.name, f"{_text(goal)} is {where} the {box}{self._slack_text()}")
+        return None
+
+    def _refusal(self, start: Span, goal: Pair, rests: bool) -> KeptOut | None:
+        """Why a move may not go out, None if it may."""
+        refusal = self._goal_refusal(goal)
+        if refusal is not None:
+            return refusal
+        inside = self.holding(start)
+        if inside:
+            return self._leaving_refusal(start, goal, rests, inside[0])
+        way = Span.around(*start.corners, *Span.around(goal).grown(*self.beyond_rad).corners)
+        for box, near in zip(self.boxes, self._near(start), strict=True):
+            if way.enters(near):
+                between = f"between {_text(_middle(start))} and {_text(goal)} the head may pass the {box}"
+                return KeptOut(box.name, f"{between}{self._slack_text()}: each axis goes at its own pace")
+        return None
+
+    def _leaving_refusal(self, start: Span, goal: Pair, rests: bool, box: Box) -> KeptOut | None:
+        """Why a move may not go out from inside a box, None if it leads out of it."""
         at = _middle(start)
         inside = f"the head stands in the {box}"
         if not rests:
-            raise KeptOut(box.name, f"{inside} and moves; it is led out when it rests")
+            return KeptOut(box.name, f"{inside} and moves; it is led out when it rests")
         end = self.way_out(at)
         if end is None:
-            raise KeptOut(box.name, f"{inside}, and no way along one axis leads out of it; turn it by hand")
+            return KeptOut(box.name, f"{inside}, and no way along one axis leads out of it; turn it by hand")
         axis = 0 if abs(end[0] - at[0]) > abs(end[1] - at[1]) else 1
         out = end[axis] - at[axis]
         along = (goal[axis] - end[axis]) * math.copysign(1.0, out) >= -ASIDE_RAD
         rest = Span.around((goal[0], at[1]) if axis == 0 else (at[0], goal[1]), end)
         aside = abs(goal[1 - axis] - at[1 - axis]) > ASIDE_RAD
-        if not along or aside or any(rest.enters(full) for full in self.full):
-            raise KeptOut(
-                box.name, f"{inside}; the one move that is taken from there is out, to {_text(end)}"
-            )
+        if along and not aside and not any(rest.enters(full) for full in self.full):
+            return None
+        return KeptOut(box.name, f"{inside}; the one move that is taken from there is out, to {_text(end)}")
+
+    def _near(self, start: Span) -> list[Span]:
+        """Every box with as much of its margin as a start leaves: nearer than it is, nothing goes."""
+        margins = [min(self.margin_rad, max(0.0, start.gap(box.span))) for box in self.boxes]
+        return [box.span.grown(margin, margin) for box, margin in zip(self.boxes, margins, strict=True)]
 
     def _slack_text(self) -> str:
         pan, tilt = self.slack_rad
