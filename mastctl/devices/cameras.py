@@ -13,13 +13,12 @@ from functools import partial
 import numpy as np
 
 from calib.geometry.mode import SensorMode
-from calib.geometry.rig import Rig, RigCamera
+from calib.geometry.rig import JointErrors, Rig, RigCamera
 from drivers.absent import AbsentCamera
-from drivers.clock import Clock
+from drivers.clock import Clock, deadlines_on
 from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame
 from drivers.frame_times import Offset, Pace, Pairing, learned
 from drivers.interfaces import Camera, CameraSetting, Frame, FrameTime, Reading
-from mastctl.control.machine import StandingFault
 from mastctl.devices import frames as frame_checks
 from mastctl.devices.frames import FrameStore, StampedFrame, check_known, check_wanted, checked_setting
 from mastctl.devices.joint_history import JointHistory
@@ -28,6 +27,7 @@ from mastctl.errors import NotNow
 
 log = logging.getLogger(__name__)
 
+HEAD = "pan_tilt"
 READINGS_S = 1.0  # for the head's readings to reach beyond an exposure
 SIZE_TIMEOUT_S = 1.0
 CAMERA_GRACE_S = 3.0  # beyond the time given to next_frame: copying and decoding on a busy machine
@@ -40,123 +40,12 @@ FAULTS = {
     "release_exposure": "an operation has held and released the exposure again",
 }
 
-HOLD_TIMEOUT_S = 3.0  # a driver waits up to 2 s for changes under way to show
+FIX_TIMEOUT_S = 3.0  # a driver waits up to 2 s for changes under way to show
 SET_TIMEOUT_S = 2.0
 
 
-class SettingsInUse:
-    """The settings of all cameras, changed between operations; safe from any thread.
-
-    ``cameras`` and ``threads`` may get other entries later. ``clock`` stamps the faults.
-    """
-
-    def __init__(
-        self, cameras: Mapping[str, Camera], threads: Mapping[str, DeviceThread], clock: Clock
-    ) -> None:
-        self._cameras = cameras
-        self._threads = threads
-        self._clock = clock
-        self._fixed = Counter[str]()  # by how many operations, of each camera, counted in its own thread
-        self._focus: Mapping[str, StandingFault] = {}  # replaced, never edited
-        self._calibrated_focus: dict[str, float] = {}  # as it was before its first change
-
-    def of(self, name: str) -> tuple[list[CameraSetting], bool]:
-        """Return what a camera is set to, and whether an operation keeps it; empty if nothing can change.
-
-        Raises NotKnown; NoReply, BadReply, DriverError if the camera does not answer within 2 s.
-        """
-        check_known(name, self._cameras)
-        return self._threads[name].call(
-            "settings", lambda: (self._read(name), self._fixed[name] > 0), SET_TIMEOUT_S, noted=False
-        )
-
-    def change(self, name: str, wanted: Mapping[str, float]) -> list[str]:
-        """Change some of a camera's settings; return a sentence for each that became another than wanted.
-
-        Raises BadSetting for one that it lacks, cannot change, or that is out of its bounds; NotNow ``busy``
-        if an operation keeps them; else as `of`.
-        """
-        check_known(name, self._cameras)
-
-        def change() -> list[str]:
-            if self._fixed[name]:
-                why = "an operation compares its pictures and holds its settings; wait for it or stop it"
-                raise NotNow("busy", f"{name}: {why}")
-            before = self._read(name)
-            changes = check_wanted(before, wanted, name)
-            try:
-                return [str(note) for note in self._cameras[name].adjust(changes)]
-            finally:
-                if "focus" in wanted:
-                    with suppress(Exception):  # the first error counts
-                        self._compare_focus(name, before, self._read(name))
-
-        return self._threads[name].call("adjust", change, SET_TIMEOUT_S, noted=False)
-
-    @contextmanager
-    def fixed(self) -> Iterator[None]:
-        """Keep every camera's exposure and settings as they are inside the block.
-
-        Both ends are queued in each camera's own thread, and no caller waits for them. The beginning comes
-        before every image that is taken after it, the end after the beginning, however late that is. So a
-        camera that hangs or refuses keeps no operation waiting; its fault says so.
-        """
-        stacks = {name: ExitStack() for name in self._threads}
-
-        def begin(name: str) -> None:
-            self._fixed[name] += 1
-            stacks[name].callback(self._fixed.subtract, [name])
-            stacks[name].enter_context(self._cameras[name].exposure_held())
-
-        def queue(what: str, name: str, function: Callable[[], None]) -> None:
-            with suppress(DriverError):  # closed, and with it the camera
-                self._threads[name].submit(what, function, HOLD_TIMEOUT_S)
-
-        for name in stacks:
-            queue("hold_exposure", name, partial(begin, name))
-        try:
-            yield
-        finally:
-            for name, stack in stacks.items():
-                queue("release_exposure", name, stack.close)
-
-    def calibrated(self) -> None:
-        """Treat the focus that each camera has now as that of the mast file, which came into use."""
-        self._calibrated_focus, self._focus = {}, {}
-
-    def faults(self) -> list[StandingFault]:
-        """Return a fault for each camera that has another focus than it was calibrated with."""
-        return list(self._focus.values())
-
-    def _read(self, name: str) -> list[CameraSetting]:
-        """In the camera's thread: what it states, if that can be."""
-        return [checked_setting(one, name) for one in self._cameras[name].settings()]
-
-    def _compare_focus(
-        self, name: str, before: Sequence[CameraSetting], after: Sequence[CameraSetting]
-    ) -> None:
-        had, now = (
-            next((one.value for one in some if one.name == "focus"), None) for some in (before, after)
-        )
-        former = self._focus.get(name)
-        self._focus = {key: one for key, one in self._focus.items() if key != name}
-        if had is None or now is None:
-            return
-        calibrated = self._calibrated_focus.setdefault(name, had)
-        if now != calibrated:
-            fault = StandingFault(
-                name,
-                "refocused",
-                f"{name}: its focus is {now:g} and was {calibrated:g} when the mast file came into "
-                "use; the calibration is not of this focus",
-                self._clock.now_s() if former is None else former.since_s,
-                f"its focus is {calibrated:g} again, or another mast file is in use",
-            )
-            self._focus = {**self._focus, name: fault}
-
-
 class Cameras:
-    """The cameras behind their threads: the part of `mastctl.devices.devices.Devices` that takes images.
+    """The part of `mastctl.devices.devices.Devices` that takes images; a subclass reads the head.
 
     ``store`` has the frames that are kept. ``sensor_modes`` says which pixels of its sensor each camera's
     images show, of those that are open and know it. Raises BadFrame if a camera that knows its size, or its
@@ -167,32 +56,91 @@ class Cameras:
         self,
         cameras: Mapping[str, Camera],
         store: FrameStore,
-        history: JointHistory,
-        read: Callable[[], Reading],
-        head: str,
         clock: Clock,
-        time: Clock,
         rig: Rig | None,
-        grace_s: float | None,
+        grace_s: float = CAMERA_GRACE_S,
     ) -> None:
-        self._cameras = dict(cameras)
-        self._threads: dict[str, DeviceThread] = {}
-        self.settings = SettingsInUse(self._cameras, self._threads, clock)
         self.store = store
-        self._history = history
-        self._read_head = read
-        self._head_name = head
-        self._clock = clock
-        self._time = time
-        self._grace_s = CAMERA_GRACE_S if grace_s is None else grace_s
         self.sensor_modes: dict[str, SensorMode] = {}
+        self._cameras = dict(cameras)
+        self._clock = clock
+        self._time = deadlines_on(clock)
+        self._grace_s = grace_s
+        self._joints = JointErrors() if rig is None else rig.joints
+        self._history = JointHistory(self._joints)
         self._calibrated: dict[str, RigCamera] = {} if rig is None else dict(rig.cameras)
+        self._fixed = Counter[str]()  # by how many operations, of each camera, counted in its own thread
         self._paired_s: dict[str, float] = {}  # per camera when the last frame that served a set began
         self._learned: dict[tuple[str, str], Offset] = {}
         self._still_since: dict[str, StampedFrame] = {}  # per camera the first frame of the same content
-        self._threads.update({name: self._thread_of(name) for name in self._cameras})
+        self._threads = {name: self._thread_of(name) for name in self._cameras}
         if rig is not None:
             self._check_sizes()
+
+    def read(self) -> Reading:
+        """Return the joint state measured now. Raises NoReply, BadReply, DriverError."""
+        raise NotImplementedError
+
+    def settings(self, camera: str) -> tuple[list[CameraSetting], bool]:
+        """Return what a camera is set to, and whether an operation keeps it; empty if nothing can change.
+
+        Raises NotKnown; NoReply, BadReply, DriverError if the camera does not answer within 2 s.
+        """
+        check_known(camera, self._cameras)
+        return self._threads[camera].call(
+            "settings",
+            lambda: (self._settings_of(camera), self._fixed[camera] > 0),
+            SET_TIMEOUT_S,
+            noted=False,
+        )
+
+    def change_settings(self, camera: str, wanted: Mapping[str, float]) -> list[str]:
+        """Change some of a camera's settings; return sentences about what became another than wanted.
+
+        Raises BadSetting for one that it lacks, cannot change, or that is out of its bounds; NotNow ``busy``
+        if an operation keeps them; else as `settings`.
+        """
+        check_known(camera, self._cameras)
+
+        def change() -> list[str]:
+            if self._fixed[camera]:
+                why = "an operation compares its pictures and keeps its settings; wait for it or stop it"
+                raise NotNow("busy", f"{camera}: {why}")
+            before = self._settings_of(camera)
+            notes = [str(note) for note in self._cameras[camera].adjust(check_wanted(before, wanted, camera))]
+            had = next((one.value for one in before if one.name == "focus"), None)
+            if had is not None and wanted.get("focus", had) != had:
+                notes.append(f"{camera}: its focus was {had:g}; a mast file is of one focus alone")
+            return notes
+
+        return self._threads[camera].call("adjust", change, SET_TIMEOUT_S, noted=False)
+
+    @contextmanager
+    def exposure_fixed(self) -> Iterator[None]:
+        """Keep every camera's exposure and settings as they are inside the block.
+
+        Both ends are queued in each camera's own thread, and no caller waits for them. The beginning comes
+        before every image that is taken after it, the end after the beginning, however late that is. So a
+        camera that hangs or refuses keeps no operation waiting; its fault says so.
+        """
+        stacks = {name: ExitStack() for name in self._cameras}
+
+        def begin(name: str) -> None:
+            self._fixed[name] += 1
+            stacks[name].callback(self._fixed.subtract, [name])
+            stacks[name].enter_context(self._cameras[name].exposure_held())
+
+        def queue(call: str, name: str, function: Callable[[], None]) -> None:
+            with suppress(DriverError):  # closed, and with it the camera
+                self._threads[name].submit(call, function, FIX_TIMEOUT_S)
+
+        for name in stacks:
+            queue("hold_exposure", name, partial(begin, name))
+        try:
+            yield
+        finally:
+            for name, stack in stacks.items():
+                queue("release_exposure", name, stack.close)
 
     def frames(
         self,
@@ -324,6 +272,9 @@ class Cameras:
             width, height = map(int, info.size_px)
             frame_checks.check_size(name, (width, height), calibrated.model.size_px)
 
+    def _settings_of(self, camera: str) -> list[CameraSetting]:
+        return [checked_setting(one, camera) for one in self._cameras[camera].settings()]
+
     def _pace_of(self, name: str) -> Pace | None:
         """What a camera states of its frames' times; None for one without a steady rate."""
         camera = self._cameras[name]
@@ -356,7 +307,7 @@ class Cameras:
     def _known_from(self, exposed_after_s: float) -> float:
         """The moment, or a later one before which the place of the head is not known."""
         if (oldest_s := self._history.oldest_s) is None:
-            oldest_s = self._read_head().time_s
+            oldest_s = self.read().time_s
         return max(exposed_after_s, oldest_s)
 
     def _offsets(self, names: Sequence[str], deadline_s: float) -> dict[str, Offset]:
@@ -400,7 +351,7 @@ class Cameras:
             began_s = min(frame.exposure_began_s for frame in frames.values())
             ended_s = max(frame.mid_exposure_s + frame.exposure_s / 2 for frame in frames.values())
             middle_s = (began_s + ended_s) / 2
-            moving = self._history.at_exposure(began_s, middle_s, ended_s, self._head_name).moving
+            moving = self._history.at_exposure(began_s, middle_s, ended_s, HEAD).moving
         return {name: replace(frame, moving=True) for name, frame in frames.items()} if moving else frames
 
     def _stamped(self, camera: str, frame: Frame | StampedFrame, published: bool = True) -> StampedFrame:
@@ -413,9 +364,9 @@ class Cameras:
         ended_s = frame.mid_exposure_s + frame.exposure_s / 2
         until_s = self._time.now_s() + READINGS_S
         while (newest := self._history.newest) is None or newest.time_s < ended_s:
-            if self._read_head().time_s < ended_s and self._time.now_s() > until_s:
-                raise BadReply("the readings stay behind the frame's exposure", device=self._head_name)
-        joints = self._history.at_exposure(began_s, frame.mid_exposure_s, ended_s, self._head_name)
+            if self.read().time_s < ended_s and self._time.now_s() > until_s:
+                raise BadReply("the readings stay behind the frame's exposure", device=HEAD)
+        joints = self._history.at_exposure(began_s, frame.mid_exposure_s, ended_s, HEAD)
         frame_id, mast_digest = self.store.name(camera, frame.sequence)
         stamped = StampedFrame(
             frame_id=frame_id,

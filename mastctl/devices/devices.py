@@ -14,16 +14,16 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
-from calib.geometry.rig import JointErrors, Rig
-from drivers.clock import Clock, deadlines_on
+from calib.geometry.rig import Rig
+from drivers.clock import Clock
 from drivers.errors import BadReply, DriverError, NoReply
 from drivers.interfaces import COARSE_COUNT_RAD, AxisReport, Camera, PanTilt
 from drivers.options import is_number
 from mastctl.control.machine import StandingFault, StateMachine, same_faults
 from mastctl.devices import joint_history
-from mastctl.devices.cameras import Cameras
+from mastctl.devices.cameras import CAMERA_GRACE_S, HEAD, Cameras
 from mastctl.devices.frames import FrameStore, StampedFrame, random_run
-from mastctl.devices.joint_history import HeadReading, JointHistory
+from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.judge import KeepOutJudge, Limits, SunDirection
 from mastctl.devices.keep_out import Pair
 from mastctl.devices.thread import AT_ONCE_S, PATIENCE_S, DeviceThread, HeadThread
@@ -31,7 +31,6 @@ from mastctl.errors import MastctlError, Stopped
 
 log = logging.getLogger(__name__)
 
-HEAD = "pan_tilt"
 READ_TIMEOUT_S = 1.0
 MOVE_TIMEOUT_S = 1.0
 STOP_TIMEOUT_S = 1.0
@@ -70,7 +69,7 @@ class Devices(Cameras):
     rig
         The mast file's content; without it image sizes are not checked and no camera is declared frozen.
     camera_grace_s
-        How long past its time a camera may take before it hangs, seconds; `CAMERA_GRACE_S` by default.
+        How long past its time a camera may take before it hangs, seconds.
     machine
         Gets whether the head moves and what is wrong with it; its publisher each reading, each frame's facts
         and each device's faults. One of its own by default.
@@ -94,7 +93,7 @@ class Devices(Cameras):
         mast_digest: str,
         clock: Clock,
         rig: Rig | None = None,
-        camera_grace_s: float | None = None,
+        camera_grace_s: float = CAMERA_GRACE_S,
         new_run: Callable[[], str] = random_run,
         sun: SunDirection | None = None,
         machine: StateMachine | None = None,
@@ -105,29 +104,24 @@ class Devices(Cameras):
         self.latched: Callable[[], Stopped | None] = lambda: None
         self._pan_tilt = hardware.pan_tilt
         self.judge = KeepOutJudge(limits, hardware.pan_tilt, clock, HEAD, rig, sun)
-        deadlines = deadlines_on(clock)
-        self._joints = JointErrors() if rig is None else rig.joints
-        history = JointHistory(self._joints)
-        store = FrameStore(mast_digest, new_run=new_run, on_new=self._new_frame)
         self._blocks: dict[object, str] = {}  # why no move is let out, by who blocks it
         self._closed = False
         self.reports: Mapping[str, AxisReport] = {}
         self._reported_s: Mapping[str, float] = {}  # what the head reports about itself, and since when
-        super().__init__(
-            hardware.cameras, store, history, self.read, HEAD, clock, deadlines, rig, camera_grace_s
-        )
+        store = FrameStore(mast_digest, new_run, self._new_frame)
+        super().__init__(hardware.cameras, store, clock, rig, camera_grace_s)
         self._head = HeadThread(
             HEAD,
             lambda: self._pan_tilt.stop(),
             AT_ONCE_S if self._pan_tilt.info.stops_beside is True else PATIENCE_S,
-            deadlines,
+            self._time,
             FAULTS,
         )
         self._head.poll("read", self._poll, READ_TIMEOUT_S)
         self._sources: tuple[Callable[[], Sequence[StandingFault]], ...] = (self._faults,)
         self._published: dict[str, tuple[StandingFault, ...]] = {}  # faults by device
         self._comparing = threading.Lock()
-        self._watch = DeviceThread("faults", clock=deadlines)
+        self._watch = DeviceThread("faults", clock=self._time)
         self._watch.poll("check", self.check_faults, 1.0)
 
     @property
@@ -234,7 +228,6 @@ class Devices(Cameras):
     def use_rig(self, rig: Rig, mast_digest: str) -> None:
         """Stamp frames with another mast file from now on, and forget those that were stamped before."""
         self._calibrated = dict(rig.cameras)
-        self.settings.calibrated()
         self._joints = rig.joints
         self._history.use_joints(rig.joints)
         self.judge.use_rig(rig)
@@ -277,7 +270,7 @@ class Devices(Cameras):
         ]
         judged = self.judge.faults(self._history.newest)
         cameras = (fault for thread in self._threads.values() for fault in thread.faults())
-        return (*self._head.faults(), *reported, *judged, *cameras, *self.settings.faults())
+        return (*self._head.faults(), *reported, *judged, *cameras)
 
     def errors(self) -> dict[tuple[str, str, str], int]:
         """Return how often calls have failed since the start: by device, call, and the error's code."""

@@ -59,9 +59,7 @@ class Limits:
     A pan that turns more than a turn has its cable's winding bounded by them: angles whole turns apart are
     different ones. ``margin_rad`` is around every keep-out: no goal lies in it, and no move but that of a
     head which is in it already. The axes speed up and brake with no more than ``acceleration_rad_per_s2``;
-    None: whatever they do. ``keep_out`` is where the head must not be.
-
-    Raises ValueError if a bound is not finite, a range is empty, or speed or acceleration is not positive.
+    None: whatever they do. ``keep_out`` is where the head must not be. The configuration checks the numbers.
     """
 
     pan_rad: tuple[float, float]
@@ -70,20 +68,6 @@ class Limits:
     margin_rad: float = 0.0
     acceleration_rad_per_s2: float | None = None
     keep_out: tuple[Box, ...] = ()
-
-    def __post_init__(self) -> None:
-        for axis, (low, high) in (("pan_rad", self.pan_rad), ("tilt_rad", self.tilt_rad)):
-            if not (math.isfinite(low) and math.isfinite(high) and low < high):
-                raise ValueError(
-                    f"{axis} is [{low}, {high}] where [lowest, highest] with lowest < highest is expected"
-                )
-        if not (math.isfinite(self.speed_rad_per_s) and self.speed_rad_per_s > 0.0):
-            raise ValueError(f"speed_rad_per_s is {self.speed_rad_per_s} where a number above 0 is expected")
-        acceleration = self.acceleration_rad_per_s2
-        if acceleration is not None and not (math.isfinite(acceleration) and acceleration > 0.0):
-            raise ValueError(f"acceleration_rad_per_s2 is {acceleration} where a number above 0 is expected")
-        if not (math.isfinite(self.margin_rad) and self.margin_rad >= 0.0):
-            raise ValueError(f"margin_rad is {self.margin_rad} where 0 or more is expected")
 
     def check(self, pan_rad: float, tilt_rad: float) -> None:
         """Pass joint angles that may be commanded. Raises OutsideLimits."""

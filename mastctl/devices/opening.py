@@ -23,7 +23,8 @@ from drivers.open_hardware import open_hardware
 from drivers.open_hardware import open_one_camera as open_one_camera
 from drivers.serial_line import stable_name
 from mastctl.control.machine import latched_sentence
-from mastctl.devices.devices import HEAD, Devices
+from mastctl.devices.cameras import HEAD
+from mastctl.devices.devices import Devices
 from mastctl.devices.judge import KeepOutJudge, Limits, SunDirection
 from mastctl.errors import Stopped
 from mastctl.safety.latch import Estopped, latched_at

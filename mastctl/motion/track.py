@@ -397,7 +397,7 @@ class Tracker:
             search = TargetSearch(
                 rig, self._devices, self._limits, self._clock, self._settings, record, cancelled
             )
-            with self._devices.settings.fixed():
+            with self._devices.exposure_fixed():
                 outcomes.append(work(search))
             return outcomes[0][1]
 

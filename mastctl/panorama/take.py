@@ -157,7 +157,7 @@ class PanoramaTaker(Steps):
             views = self.capture(cameras, settled)
             if folder.index.exposure == "first" and not self._fixed:
                 self._fixed = True  # from what the automatic made of the first view
-                fix(devices.settings.fixed())
+                fix(devices.exposure_fixed())
                 views = self.capture(cameras, self.rest())
             frames = {name: folder.keep(number, name, one.frame) for name, one in views.items()}
         evidence = {name: dict(one) for name, one in self.motion_evidence.items()}

@@ -50,6 +50,7 @@ from mastctl.control.lease import Caller, LeaseTable
 from mastctl.control.machine import StandingFault, StateMachine
 from mastctl.control.operations import Operation, OperationRunner, last_frame
 from mastctl.control.publisher import Topic
+from mastctl.devices.cameras import CAMERA_GRACE_S
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import OPERATIONS, StampedFrame, check_known, random_run
 from mastctl.devices.joint_history import HeadReading
@@ -182,7 +183,7 @@ class Service:
             mast.stored.digest,
             clock,
             mast.stored.rig,
-            None if self.hardware.simulation is None else RENDERING_S,
+            CAMERA_GRACE_S if self.hardware.simulation is None else RENDERING_S,
             new_run,
             config.sun,
             machine,

@@ -99,7 +99,7 @@ class Steering:
             loop = self._loop()
 
             def run(record: Callable[[Any], None], cancelled: threading.Event) -> Any:
-                with self._devices.settings.fixed():
+                with self._devices.exposure_fixed():
                     return loop(record, cancelled).run(request, view_rad)
 
             return self._operations.start(recorded, run, partial(self._drift.ended, mast.stored))

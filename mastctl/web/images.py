@@ -82,12 +82,12 @@ def add_cameras(app: FastAPI) -> None:
     @command(app, "PATCH /cameras/{camera}/settings", CAMERA_SETTINGS)
     def change(camera: str, body: CameraSettingsBody, here: Here) -> CameraSettingsAnswer:
         """Change some of a camera's settings, each with its automatic turned off."""
-        return _settings(here, camera, here.service.devices.settings.change(camera, body.wanted))
+        return _settings(here, camera, here.service.devices.change_settings(camera, body.wanted))
 
 
 def _settings(here: Parts, camera: str, notes: list[str]) -> CameraSettingsAnswer:
     devices = here.service.devices
-    found, fixed = devices.settings.of(camera)
+    found, fixed = devices.settings(camera)
     mode = devices.sensor_modes.get(camera)
     return {
         "camera": camera,

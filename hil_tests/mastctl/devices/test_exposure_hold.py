@@ -71,7 +71,7 @@ def failing(error: BaseException) -> Callable[[], None]:
 def test_an_exposure_is_fixed_for_the_images_of_a_block(
     devices: Devices, hardware: FakeHardware, clock: Turned
 ) -> None:
-    with pytest.raises(ZeroDivisionError), devices.settings.fixed():
+    with pytest.raises(ZeroDivisionError), devices.exposure_fixed():
         devices.frames(["navcam_left"], clock.now_s(), 1.0)
         raise ZeroDivisionError
     left = camera(hardware)
@@ -86,7 +86,7 @@ def test_a_hold_that_waits_for_a_busy_camera_comes_before_the_next_picture(
     left.hook = hang
     asker = clock.begun(lambda: devices.frames(["navcam_left"], clock.now_s(), 5.0))
     hang.reached()
-    with devices.settings.fixed():
+    with devices.exposure_fixed():
         assert left.told == []
         hang.let_go()
         clock.ended(asker)
@@ -100,14 +100,14 @@ def test_a_camera_that_cannot_hold_is_told_and_the_others_hold(
 ) -> None:
     left, right = camera(hardware), camera(hardware, "navcam_right")
     left.on_hold = failing(error)
-    with devices.settings.fixed():
+    with devices.exposure_fixed():
         devices.frames(["navcam_left", "navcam_right"], clock.now_s(), 2.0)
     clock.until(lambda: right.told == ["held", "picture", "released"], "the release of the other")
     assert left.told == ["picture"]
     (fault,) = devices.faults()
     assert fault.device == "navcam_left" and fault.until == "an operation can hold the exposure again"
     left.on_hold = lambda: None
-    with devices.settings.fixed():
+    with devices.exposure_fixed():
         pass
     clock.until(lambda: left.told == ["picture", "held", "released"], "a hold that goes well")
     assert devices.faults() == ()

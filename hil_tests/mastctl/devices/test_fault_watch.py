@@ -10,7 +10,8 @@ from drivers.errors import NoReply
 from hil_tests.mastctl.devices.turned import Hang, Turned
 from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from mastctl.control.machine import StateMachine
-from mastctl.devices.devices import HEAD, Devices
+from mastctl.devices.cameras import HEAD
+from mastctl.devices.devices import Devices
 from mastctl.devices.judge import Limits
 
 

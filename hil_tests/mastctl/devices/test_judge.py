@@ -14,7 +14,8 @@ from drivers.errors import BadOptions, BadReply
 from drivers.interfaces import AxisMotion, HeadInfo, Reading
 from hil_tests.mastctl.service_fakes import FakeHardware, FakeHead, rig
 from hil_tests.waiting import present
-from mastctl.devices.devices import HEAD, Devices
+from mastctl.devices.cameras import HEAD
+from mastctl.devices.devices import Devices
 from mastctl.devices.judge import TRAVEL_S, KeepOutJudge, Limits, SunDirection, direction_of
 from mastctl.devices.keep_out import Box, KeptOut, Pair
 

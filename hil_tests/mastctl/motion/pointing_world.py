@@ -121,7 +121,7 @@ class World:
     scene: Callable[[], TexturedPlane | Edge] = ground
 
     def __post_init__(self) -> None:
-        self.store = self.settings = self.judge = self  # as parts of the devices
+        self.store = self.judge = self  # as parts of the devices
         self._from = self._to = (0.0, -0.45)
         self._begun_s = self.clock.now_s()
         self._slip = (0.0, 0.0)
@@ -188,7 +188,7 @@ class World:
             raise NotKnown("frame_unknown", f"frame {frame_id} was not taken here")
         return self._frames[frame_id]
 
-    def fixed(self) -> AbstractContextManager[None]:
+    def exposure_fixed(self) -> AbstractContextManager[None]:
         return nullcontext()
 
     def check_from(self, start: Pair, goal: Pair) -> None:
