@@ -31,7 +31,7 @@ from calib.survey.records import Survey
 from calib.targets.boards import AnyBoard
 from mastctl.answers import MOST_CELLS, BenchProgress, Coverage
 from mastctl.bench.mast import BenchHead, BenchLook
-from mastctl.bench.survey import RunFolder, fit_in_frame, looks_of, moved_placements, stated_mast
+from mastctl.bench.survey import RunFolder, fit_in_frame, looks_of, moved_placements
 from mastctl.calibration.landing import first_cameras
 
 USUAL_PAN_RAD, USUAL_TILT_RAD = (-1.2, 1.2), (-0.9, 0.3)
@@ -234,7 +234,7 @@ class BenchKnowledge:
             return self.fitted
         self._tried_looks, survey = len(self.looks), self.kept.survey()
         notes, rig = self.kept.notes, self.head.rig
-        self.fitted = fitted = fit_in_frame(survey, stated_mast(notes), rig, moved_placements(notes))
+        self.fitted = fitted = fit_in_frame(survey, None, rig, moved_placements(notes))
         self.fitted_looks = len(self.looks)
         body = {n: c for n, c in rig.cameras.items() if c.on == "rover"}
         rig = replace(fitted.rig, cameras={**body, **fitted.rig.cameras})

@@ -17,13 +17,10 @@ from mastctl.as_json import as_json
 from mastctl.bench.check import Checked
 from mastctl.bench.run import BenchRun, Reporter
 from mastctl.bench.survey import fit_in_frame
-from mastctl.calibration.drawn import cells_seen
 from mastctl.calibration.landing import expected_pointing
 from mastctl.calibration.run import checked_survey, conclude, fit_document, picked, with_fit
 from mastctl.calibration.verdict import CalibrationVerdict, judge
 from mastctl.report.pages import Table
-
-HALF = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +48,6 @@ class BenchDone:
     pictures: int = 0
     page: Path | None = None
 
-    @property
-    def coverage(self) -> dict[str, float]:
-        """Part of each camera's image in which corners were fitted, 0 to 1."""
-        cameras = sorted({image.camera for image in self.calibration.images})
-        return {name: float((cells_seen(self.calibration, name)[0] > 0).mean()) for name in cameras}
-
     def as_json(self) -> dict[str, Any]:
         """Return it as the command prints it."""
         fit = self.calibration
@@ -68,47 +59,13 @@ class BenchDone:
             "gauges": list(fit.gauges),
             "outliers": [outlier.sentence for outlier in fit.outliers],
             "survey": {"folder": str(self.survey.folder), "digest": self.survey.digest},
-            **picked(
-                self, "coverage", "placements", "pictures", "predicted_px", "calibrated_px", "counts_px"
-            ),
+            **picked(self, "placements", "pictures", "predicted_px", "calibrated_px", "counts_px"),
             "report": None if self.page is None else str(self.page),
         }
         if self.checked is not None:
             keys = "promised_px", "pointings", "pointing_rms_px", "pointing_promised_px"
             document["check"] = picked(self.checked, *keys)
         return document
-
-    def lines(self) -> Iterator[str]:
-        """Yield all but the verdict for a person."""
-        fit, promised_px = self.calibration, {} if self.checked is None else self.checked.promised_px
-        for name, (x, y) in fit.rms_px.items():
-            line = f"{name}: rms {x:.3f}, {y:.3f} px"
-            if name in fit.check_rms_px:
-                check = fit.check_rms_px[name]
-                line += f"; not fitted {check[0]:.3f}, {check[1]:.3f} px"
-                line += f" (promised {promised_px[name]:.3f})" if name in promised_px else ""
-            yield line
-        for term in fit.terms:
-            yield term.sentence
-        yield from (f"{quantity}: {value}" for quantity, value in self.worth)
-        yield from (f"fixed: {sentence}" for sentence in fit.gauges)
-        yield from (f"note: {sentence}" for sentence in fit.notes)
-        yield from (f"left out: {outlier.sentence}" for outlier in fit.outliers[:10])
-        yield f"mast file: {self.saved.path} ({self.saved.digest[:12]})"
-        yield f"survey: {self.survey.folder}"
-        if self.page is not None:
-            yield f"report: {self.page}"
-        yield from (f"{reason.grade}: {reason.sentence}" for reason in self.verdict.reasons)
-
-    def verdict_line(self) -> str:
-        """Return the verdict, with the cameras of whose image less than `HALF` was seen."""
-        few = [f"{name} {100 * part:.0f} %" for name, part in self.coverage.items() if part < HALF]
-        if not few:
-            return f"verdict: {self.verdict.advice}"
-        return (
-            f"verdict: {self.verdict.advice}, but corners were seen over less than half of the image of "
-            f"{', '.join(few)}; where none were, the lens is extrapolated"
-        )
 
 
 def finish(bench: BenchRun, reporter: Reporter, out: Path, report: Path | None) -> BenchDone:

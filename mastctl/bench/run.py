@@ -7,7 +7,7 @@ from there. At its end are images that are not fitted, and pointings at corners,
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Protocol
@@ -318,8 +318,6 @@ def open_run(
     folder: Path,
     reporter: Reporter,
     wanted: BenchGoal,
-    cameras: Sequence[str] = (),
-    mast_at: Sequence[float] | None = None,
 ) -> BenchRun:
     """Return a run on a daemon's head, which ``client`` may steer, with a new or former survey ``folder``.
 
@@ -327,11 +325,11 @@ def open_run(
     the daemon refuses a query.
     """
     status = client.status()
-    mast = DaemonMast(client, cameras or list(status["cameras"]), board)
+    mast = DaemonMast(client, list(status["cameras"]), board)
     head = mast.head
     sigma = Sigma(0.0, 0.0, joint_rad=head.count_rad / 12**0.5, corner_px=0.1)
     kept = RunFolder(folder, board, sigma, head.rig)
-    kept.begin(client.mast_file(), mast_at)
+    kept.begin(client.mast_file())
     simulated = SimulatedBoard(client, board, head.rig) if status["simulated"] else None
     return BenchRun(mast, kept, board, reporter, wanted, simulated)
 

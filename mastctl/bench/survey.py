@@ -40,14 +40,6 @@ FORMER = "former_mast.yaml"
 """The mast file that was in use when the run began."""
 
 
-def stated_mast(notes: Sequence[Mapping[str, Any]]) -> Sequence[float] | None:
-    """Return where the mast stands at zero angles by a run's journal; None: as in the former mast file.
-
-    That is x, y, z, metres, and three angles, radians, as in a mast file.
-    """
-    return next((note.get("mast_at") for note in reversed(notes) if note.get("event") == "frame"), None)
-
-
 class RunFolder:
     """The folder of one run; whatever it was given is on the disk when a call returns.
 
@@ -68,16 +60,14 @@ class RunFolder:
             number = _number_of(image, path)
             self._numbers[image.placement] = max(number, self._numbers.get(image.placement, 0))
 
-    def begin(self, former: bytes, mast_at: Sequence[float] | None) -> None:
-        """Keep the mast file in use, unless one is kept already, and where the mast stands if stated."""
+    def begin(self, former: bytes) -> None:
+        """Keep the mast file in use, unless one is kept already."""
         path = self.path / FORMER
         try:
             if not path.exists():
                 replace_bytes(path, former, 0o644)
         except OSError as error:
             raise NotWritten(path, "", f"cannot be written: {error.strerror or error}") from None
-        if mast_at is not None and list(mast_at) != stated_mast(self.notes):
-            self.note(event="frame", mast_at=list(mast_at))
 
     def survey(self) -> Survey:
         """Return all that was seen."""
@@ -194,7 +184,7 @@ def _number_of(image: SurveyImage, path: Path) -> int:
     if not (number.isascii() and number.isdigit()):
         reason = (
             f"{image.name} where PLACEMENT-NUMBER-CAMERA is expected: no run took these pictures; "
-            "fit them by `mastctl calibrate bench FOLDER`, or name another folder for a run (--survey)"
+            "fit them by `mastctl calibrate bench FOLDER`, or begin another run"
         )
         raise BadFile(path / "images.csv", "", reason)
     return int(number)
@@ -226,7 +216,7 @@ def fit_in_frame(
     former: Rig | None,
     moved: Mapping[str, float] | None = None,
 ) -> BenchCalibration:
-    """Fit a bench with the mast where `stated_mast` has it, else where the ``former`` rig has it.
+    """Fit a bench with the mast at ``mast_at``, else where the ``former`` rig has it.
 
     ``moved`` as of `moved_placements`: where the fit does not find out what moved when, it does without them.
     Raises BenchNotFitted if the images do not determine a rig.

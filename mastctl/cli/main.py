@@ -52,7 +52,7 @@ OVERVIEW: Mapping[str, Mapping[str, tuple[str, str]]] = {
     "calibration and acceptance": {
         "board": ("board", "a board to calibrate with: make one, measure it, find it"),
         "calibrate": ("calibrate", "fit a mast file to a survey; 'calibrate bench': to a board"),
-        "calibrate bench": ("calibrate_bench", ""),
+        "calibrate bench": ("calibrate", ""),
         "conform": ("conform", "accept a rig through its running daemon"),
     },
     "a rig of your own": {

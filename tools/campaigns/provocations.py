@@ -27,11 +27,14 @@ import io
 import json
 import math
 import re
+import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -57,6 +60,8 @@ from calib.targets.boards import AnyBoard, AprilGrid, Charuco
 from drivers.interfaces import Image
 from hil_tests.support.sim_survey.plan import SurveyPlan, rover_from_head
 from mastctl.bench.mast import BOARD
+from mastctl.bench.operation import carry_out
+from mastctl.bench.runs import BenchJob
 from mastctl.calibration.run import SurveyRefused, checked_survey
 from mastctl.calibration.verdict import judge
 from mastctl.cli.experiment import results_of
@@ -382,27 +387,38 @@ def provoked(case: BenchCase) -> Iterator[None]:
         Client.snapshot, Client.put_board = snapshot, put_board  # type: ignore[method-assign]
 
 
+def provoked_work(name: str, job: BenchJob, link: Connection) -> None:
+    """Carry a bench out in its worker, with a case of this name."""
+    with provoked(next(one for one in CASES if one.name == name)):
+        carry_out(job, link)
+
+
 def bench_row(name: str) -> tuple[str, int, int, str]:
     """Name, exit code, pictures kept, and the sentence: a refusal, else the verdict and what is not well."""
-    case = next(one for one in CASES if one.name == name)
     config = load_config(config_folder() / "bench.yaml")
     simulation = {**config.hardware.simulation, "speed": "max", "samples": 1}
-    config = replace(config, listen=Listen(port=0), hardware=replace(config.hardware, simulation=simulation))
-    with RunningDaemon(config) as daemon, tempfile.TemporaryDirectory() as folder:
-        return name, *bench_answer(case, daemon.url, Path(folder))
+    hardware = replace(config.hardware, simulation=simulation)
+    with tempfile.TemporaryDirectory() as folder:
+        mast_file = Path(shutil.copy(config.mast_file, folder))  # the run's own goes beside it
+        config = replace(config, listen=Listen(port=0), hardware=hardware, mast_file=mast_file)
+        with RunningDaemon(config) as daemon:
+            daemon.service.bench.work = partial(provoked_work, name)
+            return name, *bench_answer(daemon.url, Path(folder))
 
 
-def bench_answer(case: BenchCase, url: str, folder: Path) -> tuple[int, int, str]:
+def bench_answer(url: str, folder: Path) -> tuple[int, int, str]:
     """Exit code, pictures kept, and the sentence of a bench."""
     board, out = folder / "board.yaml", folder / "mast.yaml"
     save_board(board, PRINTED)
     command = ["calibrate", "bench", "--url", url, "--board", board, "--out", out, "--json"]
     printed = io.StringIO()
-    with provoked(case), contextlib.redirect_stdout(printed):
+    with contextlib.redirect_stdout(printed):
         code = mastctl([str(word) for word in command])
     document = json.loads(printed.getvalue())
     try:
-        kept = len(read_survey(folder / "mast.bench").images)
+        with Client(url) as client:
+            runs = client.bench()
+        kept = len(read_survey(Path(runs["folder"], runs["runs"][0]["name"], "seen")).images)
     except CalibError as error:
         return code, -1, f"THE FOLDER CANNOT BE READ: {error}"
     if "error" in document:

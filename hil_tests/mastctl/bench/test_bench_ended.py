@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import math
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
 
-from calib.calibrate.starts.bench import BenchNotFitted
+from calib.files.mast_file import load_rig
 from calib.plan.placements import Placement
 from calib.survey import writer as bench_writer
 from calib.survey.reader import read_survey
@@ -24,76 +25,116 @@ from calib.targets.board_file import save_board
 from calib.targets.boards import Charuco
 from hil_tests.mastctl.bench.bench_of_corners import CornerBench
 from hil_tests.mastctl.bench.bench_world import corner_bench, run_of
+from hil_tests.mastctl.bench.operation_world import (
+    BEGUN,
+    DONE,
+    PLACE,
+    PROGRESS,
+    answered,
+    script,
+    writes_files,
+)
 from hil_tests.mastctl.outside_daemon import write_config
 from hil_tests.mastctl.service_fakes import FakeHardware
+from hil_tests.waiting import until
 from mastctl.bench.mast import BenchInterrupted, BenchLook, NoLight, find_board
 from mastctl.bench.run import BenchRun
 from mastctl.bench.survey import looks_of
-from mastctl.cli import calibrate_bench
 from mastctl.cli.main import main
+from mastctl.client import Client
 from mastctl.daemon import RunningDaemon
 
 FULL = OSError(errno.ENOSPC, "No space left on device")
-KEPT = "everything seen is kept in {folder}: the same command goes on"
+PAIR = tuple[RunningDaemon, FakeHardware]
 
 
-def ended(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path, error: BaseException
-) -> tuple[int, str]:
-    """Exit code and sentence of a run in the middle of which something is raised."""
+def bench(capsys: pytest.CaptureFixture[str], *options: str | Path) -> tuple[int, Any, str]:
+    """Exit code, JSON and standard error of the command."""
+    capsys.readouterr()
+    code = main(["calibrate", "bench", *map(str, options), "--json"])
+    printed = capsys.readouterr()
+    return code, json.loads(printed.out), printed.err
 
-    class Ending:
-        def run(self) -> None:
-            raise error
 
-    @contextmanager
-    def bench(args: Any, board: Any, folder: Path) -> Iterator[tuple[Any, Any]]:
-        folder.mkdir()
-        yield Ending(), None
-
-    monkeypatch.setattr(calibrate_bench, "_bench", bench)
+@pytest.fixture
+def board(tmp_path: Path) -> Path:
     save_board(tmp_path / "board.yaml", Charuco(10, 7, 0.055, 0.042))
-    words = ["--board", str(tmp_path / "board.yaml"), "--out", str(tmp_path / "m.yaml"), "--json"]
-    code = main(["calibrate", "bench", *words])
-    return code, json.loads(capsys.readouterr().out)["error"]["message"]
+    return tmp_path / "board.yaml"
 
 
-@pytest.mark.parametrize(
-    ("error", "code", "said"),
-    [
-        (BenchInterrupted("somebody pressed stop"), 1, "somebody pressed stop; "),
-        (KeyboardInterrupt(), 130, "interrupted; "),
-        (NotWritten("x.csv", "p1-003", "cannot be written: No space left on device"), 2, "No space left"),
-        (BenchNotFitted("pan slipped by about 9.8 mrad"), 1, "pan slipped by about 9.8 mrad; "),
-    ],
-    ids=["stop", "ctrl-c", "full disk", "slipped"],
-)
-def test_whatever_ends_a_run_says_where_all_is_kept_and_what_goes_on(
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+def test_the_command_has_the_daemon_calibrate_and_brings_what_it_made(
+    pair: PAIR,
+    board: Path,
     tmp_path: Path,
-    error: BaseException,
-    code: int,
-    said: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    exit_code, answer = ended(monkeypatch, capsys, tmp_path, error)
-    assert exit_code == code and said in answer
-    assert KEPT.format(folder=tmp_path / "m.bench") in answer
+    daemon = pair[0]
+    daemon.service.bench.work = script(BEGUN, PLACE, answered, PROGRESS, writes_files, DONE)
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n"))
+    out, report = tmp_path / "m.yaml", tmp_path / "report"
+    code, answer, shown = bench(
+        capsys, "--url", daemon.url, "--board", board, "--out", out, "--report", report, "--by-hand"
+    )
+    assert code == 0, answer
+    assert answer["mast_file"]["digest"] == load_rig(out).digest == daemon.service.stored.digest
+    assert answer["verdict"]["words"] == "trust it" and answer["rms_px"] == {"navcam_left": [0.05, 0.06]}
+    assert len(answer["mast"]["translation_m"]) == 3 and answer["seconds"] > 0
+    assert (
+        Path(answer["report"]) == report / "bench.html" and "Residuals" in Path(answer["report"]).read_text()
+    )
+    assert "placement p1: the board straight ahead" in shown and "3 of 60 pictures a camera" in shown
+
+
+@pytest.mark.parametrize("how", ["stopped", "no operator", "ctrl-c"])
+def test_a_run_that_ends_early_says_why_and_what_goes_on(
+    pair: PAIR,
+    board: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    how: str,
+) -> None:
+    daemon = pair[0]
+    daemon.service.bench.work = script(BEGUN, PLACE, answered, DONE)
+
+    def read() -> str:
+        if how == "stopped":
+            with Client(daemon.url, name="Bo") as client:
+                client.stop()
+                until(lambda: client.control() is None, "the run's end")
+        elif how == "ctrl-c":
+            raise KeyboardInterrupt
+        return "" if how == "no operator" else "\n"
+
+    monkeypatch.setattr("sys.stdin", SimpleNamespace(readline=read, isatty=lambda: False))
+    options = ("--url", daemon.url, "--board", board, "--out", tmp_path / "m.yaml", "--by-hand")
+    code, answer, _ = bench(capsys, *options)
+    said = {
+        "stopped": "Bo",
+        "no operator": "standard input has ended",
+        "ctrl-c": "interrupted; ",
+    }
+    run = daemon.service.bench.run
+    assert run is not None and run["state"] == "interrupted"
+    assert code == (130 if how == "ctrl-c" else 1) and said[how] in answer["error"]["message"]
     assert not (tmp_path / "m.yaml").exists()
+    if how == "ctrl-c":
+        assert f"--resume {run['name']}" in answer["error"]["message"]
+        daemon.service.bench.work = script(BEGUN, writes_files, DONE)
+        assert bench(capsys, *options[:2], "--resume", run["name"], *options[4:])[0] == 0
 
 
 def test_another_mast_file_of_the_same_name_is_named_with_our_path(
-    pair: tuple[RunningDaemon, FakeHardware], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    pair: PAIR, board: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "ours").mkdir()
     config = write_config(tmp_path / "ours", f"{{port: {urlsplit(pair[0].url).port}}}")
     mast_file = config.parent / "little.yaml"
     mast_file.write_text(mast_file.read_text() + "# ours\n")
-    save_board(tmp_path / "board.yaml", Charuco(10, 7, 0.055, 0.042))
-    words = ["--board", tmp_path / "board.yaml", "--out", tmp_path / "m.yaml", "--config", config, "--json"]
-    assert main(["calibrate", "bench", *map(str, words)]) == 1
-    error = json.loads(capsys.readouterr().out)["error"]
-    assert error["code"] == "other_daemon"
+    code, answer, _ = bench(capsys, "--board", board, "--out", tmp_path / "m.yaml", "--config", config)
+    error = answer["error"]
+    assert code == 1 and error["code"] == "other_daemon"
     assert f"uses a little.yaml that differs from {mast_file}; end it" in error["message"]
 
 
