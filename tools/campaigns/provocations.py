@@ -13,7 +13,7 @@ mast's squared distance what chance makes of it once in 370. Trusted is "trust i
 care", rejected "do not trust it"; a refusal to calibrate counts by itself. *Named* are the surveys whose
 cause a sentence, or a measurement that was left out, names.
 
-A bench is driven through `mastctl calibrate bench` on the packaged simulated bench, one run a case. Boards
+A bench is run by a daemon on the packaged simulated bench, one run a case. Boards
 are rendered where and as they are wrong; darkness and cables are the simulator's faults; what a camera would
 do to a picture (mirrored print, focus, blur) is done to its pixels by OpenCV on the path to the command.
 Printed are the exit code, the pictures in the folder afterwards, and the sentence.
@@ -22,9 +22,6 @@ Printed are the exit code, the pictures in the folder afterwards, and the senten
 from __future__ import annotations
 
 import argparse
-import contextlib
-import io
-import json
 import math
 import re
 import shutil
@@ -53,7 +50,6 @@ from calib.geometry.rig import MAST_NAMES, Rig, numbers_of
 from calib.geometry.rigid import FloatArray
 from calib.geometry.significance import Level
 from calib.geometry.stereo import triangulate
-from calib.survey.reader import read_survey
 from calib.survey.records import Sigma
 from calib.targets.board_file import document_of, save_board
 from calib.targets.boards import AnyBoard, AprilGrid, Charuco
@@ -65,7 +61,6 @@ from mastctl.bench.runs import BenchJob
 from mastctl.calibration.run import SurveyRefused, checked_survey
 from mastctl.calibration.verdict import judge
 from mastctl.cli.experiment import results_of
-from mastctl.cli.main import main as mastctl
 from mastctl.client import Client, Snapshot
 from mastctl.config import Listen, load_config
 from mastctl.daemon import RunningDaemon
@@ -393,38 +388,25 @@ def provoked_work(name: str, job: BenchJob, link: Connection) -> None:
         carry_out(job, link)
 
 
-def bench_row(name: str) -> tuple[str, int, int, str]:
-    """Name, exit code, pictures kept, and the sentence: a refusal, else the verdict and what is not well."""
+def bench_row(name: str) -> tuple[str, str, int, str]:
+    """Name, state, pictures kept, and the sentence: a refusal, else the verdict and what is not well."""
     config = load_config(config_folder() / "bench.yaml")
     simulation = {**config.hardware.simulation, "speed": "max", "samples": 1}
     hardware = replace(config.hardware, simulation=simulation)
     with tempfile.TemporaryDirectory() as folder:
         mast_file = Path(shutil.copy(config.mast_file, folder))  # the run's own goes beside it
         config = replace(config, listen=Listen(port=0), hardware=hardware, mast_file=mast_file)
-        with RunningDaemon(config) as daemon:
+        save_board(board := Path(folder, "board.yaml"), PRINTED)
+        with RunningDaemon(config) as daemon, Client(daemon.url) as client:
             daemon.service.bench.work = partial(provoked_work, name)
-            return name, *bench_answer(daemon.url, Path(folder))
-
-
-def bench_answer(url: str, folder: Path) -> tuple[int, int, str]:
-    """Exit code, pictures kept, and the sentence of a bench."""
-    board, out = folder / "board.yaml", folder / "mast.yaml"
-    save_board(board, PRINTED)
-    command = ["calibrate", "bench", "--url", url, "--board", board, "--out", out, "--json"]
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
-        code = mastctl([str(word) for word in command])
-    document = json.loads(printed.getvalue())
-    try:
-        with Client(url) as client:
-            runs = client.bench()
-        kept = len(read_survey(Path(runs["folder"], runs["runs"][0]["name"], "seen")).images)
-    except CalibError as error:
-        return code, -1, f"THE FOLDER CANNOT BE READ: {error}"
-    if "error" in document:
-        return code, kept, document["error"]["message"].replace(str(folder), "FOLDER")
-    bad = [one["sentence"] for one in document["verdict"]["reasons"] if one["grade"] != "good"]
-    return code, kept, f"{document['verdict']['words']}: " + ("; ".join(bad) or "all is well")
+            client.begin_bench(board_file=board.read_text())
+            runs: Any = (event["value"] for event in client.events("bench"))
+            run = next(one for one in runs if one["step"] == "over")
+            kept = client.bench()["runs"][0]["pictures"]
+    if run["result"] is None:
+        return name, run["state"], kept, run["sentence"]
+    bad = [one["sentence"] for one in run["result"]["verdict"]["reasons"] if one["grade"] != "good"]
+    return name, run["state"], kept, f"{run['sentence']}: " + ("; ".join(bad) or "all is well")
 
 
 def rig_of_pairs(file: Path, pairs: Sequence[str]) -> Rig:
@@ -461,7 +443,7 @@ def benches(args: argparse.Namespace) -> int:
     """Print the table of benches."""
     names = [case.name for case in CASES if not args.only or any(part in case.name for part in args.only)]
     rows = results_of(args, "benches", bench_row, names)
-    print(heading(("provoked", "exit", "pictures kept", "message")))
+    print(heading(("provoked", "state", "pictures kept", "message")))
     for row in rows:
         print(line(*row))
     return 0
