@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
-from contextlib import asynccontextmanager, suppress
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import cache
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
-from fastapi import FastAPI, Request, WebSocket
-from fastapi.exceptions import RequestValidationError
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError, WebSocketRequestValidationError
+from fastapi.requests import HTTPConnection
 from fastapi.responses import JSONResponse
-from fastapi.routing import APIRoute
-from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 from starlette.exceptions import HTTPException
 
@@ -31,10 +30,10 @@ from mastctl.errors import (
     NotNow,
     Unable,
     error_body,
+    one_line,
 )
 
 HEADERS: Mapping[str, str] = {
-    "cache-control": "no-store",
     "x-content-type-options": "nosniff",
     "cross-origin-resource-policy": "same-origin",
     "x-frame-options": "DENY",
@@ -46,21 +45,11 @@ PAGE = (
     "default-src 'self'; img-src 'self' blob: data:; object-src 'none'; base-uri 'none'; "
     "form-action 'self'; frame-ancestors 'none'"
 )
-"""The Content-Security-Policy of a page: its own files only, no script inside it, in no frame."""
+"""That of the page: its own files only, no script inside it, in no frame."""
+SITE = f"{PAGE}; script-src 'self' 'unsafe-inline'; style-src 'self' 'unsafe-inline'"
+"""That of the documentation, whose theme has scripts and styles inside its pages."""
 
 Headers = list[tuple[bytes, bytes]]
-Query = TypeVar("Query", bound=BaseModel)
-
-
-class BadHttp(MastctlError):
-    """A request that does not get as far as the API, with a status of its own."""
-
-    code = "not_json"
-
-    def __init__(self, status: int, code: str, message: str) -> None:
-        self.status = status
-        self.code = code
-        super().__init__(message)
 
 
 class JsonAnswer(JSONResponse):
@@ -79,34 +68,17 @@ def error_response(
 ) -> JSONResponse:
     """Return an error in the one form of docs/reference/http.md."""
     body = {"error": {"code": code, "message": message, "detail": detail}}
-    all_headers = {**HEADERS, "content-security-policy": NO_PAGE, **(headers or {})}
-    return JsonAnswer(body, status_code=status, headers=all_headers)
+    return JsonAnswer(body, status_code=status, headers=headers)
 
 
-@asynccontextmanager
-async def query_of(line: WebSocket, model: type[Query], listed: str) -> AsyncIterator[Query]:
-    """Yield a WebSocket's query, read as that of a route; ``listed`` may stand in it more than once.
+def marked(headers: Iterable[tuple[bytes, bytes]], policy: str, keep: str) -> Headers:
+    """Return an answer's headers with those of every answer that it does not have already.
 
-    A wrong query is refused on the line, and so is what the block refuses before it accepts.
+    ``policy`` is its Content-Security-Policy, ``keep`` its Cache-Control.
     """
-    given = line.query_params
-    query: dict[str, Any] = {name: given[name] for name in given if name != listed}
-    try:
-        yield model.model_validate(query | ({listed: given.getlist(listed)} if listed in given else {}))
-    except ValidationError as error:
-        message = sentences(error.errors(), model, "query")[0]
-        await line.send_denial_response(error_response(422, "bad_request", message))
-    except MastctlError as error:
-        await line.send_denial_response(refusal_response(error))
-
-
-def marked(headers: Iterable[tuple[bytes, bytes]]) -> Headers:
-    """Return an answer's headers with those of every answer that it does not have already."""
     given = list(headers)
     names = {name.lower() for name, _ in given}
-    kind = next((value for name, value in given if name.lower() == b"content-type"), b"")
-    policy = PAGE if kind.startswith(b"text/html") else NO_PAGE
-    wanted = {**HEADERS, "content-security-policy": policy}
+    wanted = {**HEADERS, "content-security-policy": policy, "cache-control": keep}
     return given + [(n.encode(), v.encode()) for n, v in wanted.items() if n.encode() not in names]
 
 
@@ -141,8 +113,6 @@ STATUS_OF_KIND: Mapping[type[Exception], int] = {
 
 def status_of(error: Exception) -> int:
     """Return the HTTP status of an error's family, the nearest one above its class; 500 of a defect."""
-    if isinstance(error, BadHttp):
-        return error.status
     return next((STATUS_OF_KIND[kind] for kind in type(error).__mro__ if kind in STATUS_OF_KIND), 500)
 
 
@@ -158,48 +128,47 @@ def refusal_response(error: Exception) -> JSONResponse:
 
 
 def add_errors(app: FastAPI) -> None:
-    """Every refusal in the one form."""
+    """Every refusal in the one form, of a WebSocket's request too."""
 
-    async def ours(request: Request, error: Exception) -> JSONResponse:
+    async def ours(line: HTTPConnection, error: Exception) -> JSONResponse:
         return refusal_response(error)
 
     for kind in (MastctlError, DriverError, CalibError, Exception):
         app.add_exception_handler(kind, ours)
 
-    @app.exception_handler(RequestValidationError)
-    async def invalid(request: Request, error: RequestValidationError) -> JSONResponse:
-        found = _sentences(request, error.errors()[:10])
+    async def invalid(line: HTTPConnection, error: Any) -> JSONResponse:
+        first = error.errors()[0]
+        if first["type"] == "json_invalid":
+            return error_response(400, "not_json", f"the body is not JSON: {first['ctx']['error']}")
+        if first["loc"] == ("body",) and isinstance(first["input"], bytes):
+            kind = one_line(line.headers.get("content-type", ""), 60)
+            message = f"Content-Type is '{kind}' where application/json is expected"
+            return error_response(415, "not_json", message)
+        found = _sentences(line, error.errors()[:10])
         return error_response(422, "bad_request", found[0], {"problems": found})
+
+    app.add_exception_handler(RequestValidationError, invalid)
+    app.add_exception_handler(WebSocketRequestValidationError, invalid)
 
     @app.exception_handler(HTTPException)
     async def http(request: Request, error: HTTPException) -> JSONResponse:
-        known = {
-            404: ("not_found", f"there is nothing at {request.url.path[:120]}; see /openapi.json"),
-            405: ("method_not_allowed", f"{request.method} is not possible at {request.url.path[:120]}"),
-        }
-        code, message = known.get(error.status_code, ("bad_request", str(error.detail)))
-        headers = dict(error.headers or {})
-        if error.status_code == 405:
-            headers["Allow"] = ", ".join(_methods_of(app, request))
-        return error_response(error.status_code, code, message, headers=headers)
+        path = request.url.path[:120]
+        code, message = {
+            400: ("not_json", "the body cannot be read as JSON"),
+            404: ("not_found", f"there is nothing at {path}; see /openapi.json"),
+            405: ("method_not_allowed", f"{request.method} is not possible at {path}"),
+            413: ("too_large", error.detail),
+        }.get(error.status_code, ("bad_request", error.detail))
+        return error_response(error.status_code, code, message, headers=error.headers)
 
 
-def _methods_of(app: FastAPI, request: Request) -> list[str]:
-    """The methods of a path, which may have a route for each."""
-    found = set[str]()
-    for route in app.routes:
-        if isinstance(route, APIRoute) and route.path_regex.match(request.url.path):
-            found |= route.methods or set()
-    return sorted(found)
-
-
-def _sentences(request: Request, errors: Sequence[Any]) -> list[str]:
+def _sentences(line: HTTPConnection, errors: Sequence[Any]) -> list[str]:
     """What is wrong with the part of a request whose error comes first."""
     if errors[0]["loc"] == ("body",) and errors[0].get("input") is None:
         return ["the request has no body where a JSON object is expected"]
     part = errors[0]["loc"][0]
     inside = [{**one, "loc": one["loc"][1:]} for one in errors if one["loc"][0] == part]
-    dependant = request.scope["route"].dependant
+    dependant = line.scope["route"].dependant
     if part in ("body", "query"):
         params = dependant.body_params if part == "body" else dependant.query_params
         return sentences(inside, params[0].field_info.annotation, part)

@@ -8,12 +8,12 @@ Every refusal is ``{"error": {"code", "message", "detail"}}``.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable
 from functools import cache
 from importlib.metadata import version
 from typing import Annotated, Any
 
-from fastapi import FastAPI, Request, Response
+from fastapi import FastAPI, Response
 from fastapi.responses import JSONResponse
 from fastapi.routing import APIRoute
 from fastapi.utils import create_model_field
@@ -28,7 +28,7 @@ from mastctl.web.commands import REFERENCE, Here, Parts
 from mastctl.web.events import add_events
 from mastctl.web.images import add_cameras, add_images
 from mastctl.web.keeping import add_bench, add_masts, add_places, add_recordings
-from mastctl.web.page import add_page, add_site, text_answer
+from mastctl.web.page import add_page, add_site
 from mastctl.web.panorama import add_panoramas, add_targets
 from mastctl.web.simulation import add_simulation
 from mastctl.web.steering import add_estop, add_lease, add_limits, add_pointing, add_tracking
@@ -46,34 +46,13 @@ def create_app(parts: Parts) -> ASGIApp:
     return Guard(served, parts.entrance, parts.waiting.turn, parts.service.entry)
 
 
-class _Read(Request):
-    """A request whose body the guard has read."""
-
-    async def body(self) -> bytes:
-        return bytes(self.scope["state"].get("body", b""))
-
-    async def json(self) -> Any:
-        return self.scope["state"]["json"]
-
-
 class _Route(APIRoute):
-    """A route whose body was read before, and whose answer goes out as it is made.
-
-    The answer's type is for the type checker and the description.
-    """
+    """A route whose answer goes out as it is made; its type is for the type checker and the description."""
 
     def __init__(self, path: str, endpoint: Callable[..., Any], **options: Any) -> None:
         if is_typeddict(get_type_hints(endpoint).get("return")):
             options["response_model"] = dict[str, Any]
         super().__init__(path, endpoint, **options)
-
-    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        handle = super().get_route_handler()
-
-        async def read(request: Request) -> Response:
-            return await handle(_Read(request.scope, request.receive))
-
-        return read
 
 
 @cache
@@ -100,10 +79,8 @@ def api() -> FastAPI:
         add(app)
 
     @app.get("/openapi.json", include_in_schema=False)
-    async def document(request: Request, here: Here) -> Response:
-        made = _made.cache_info().currsize > 0
-        text = description(app) if made else await here.waiting.run(lambda: description(app))
-        return text_answer(request.headers, text, "application/json")
+    async def document(here: Here) -> Response:
+        return Response(await here.waiting.run(lambda: description(app)), media_type="application/json")
 
     return app
 
@@ -134,17 +111,4 @@ def _made(app: FastAPI) -> bytes:
     for name, streams in streamed.items():
         schema = TypeAdapter(streams).json_schema(mode="serialization", ref_template=REFERENCE)
         document["components"]["schemas"] |= schema.pop("$defs", {}) | {name: schema}
-    _without_null(document)
     return bytes(JSONResponse(document).body)
-
-
-def _without_null(document: Mapping[str, Any]) -> None:
-    """Describe headers and queries as present or absent: an address has no null."""
-    for methods in document["paths"].values():
-        for operation in methods.values():
-            for parameter in operation.get("parameters", ()):
-                schema = parameter["schema"]
-                kinds = [one for one in schema.get("anyOf", ()) if one.get("type") != "null"]
-                if len(kinds) == 1:
-                    del schema["anyOf"]
-                    schema.update(kinds[0])

@@ -23,7 +23,6 @@ from mastctl.as_json import writable
 from mastctl.control.lease import Caller
 from mastctl.control.publisher import LoopSubscription, Published, Topic
 from mastctl.http import PREFIX
-from mastctl.http.refusals import query_of
 from mastctl.service.service import Service
 from mastctl.web.commands import Here, Parts, stream_of
 from mastctl.web.models import EventsQuery
@@ -61,10 +60,9 @@ def add_events(app: FastAPI) -> None:
         return _Lines(here, ("track",), None, _track)
 
     @app.websocket(EVENTS)
-    async def socket(line: WebSocket, here: Here) -> None:
-        async with query_of(line, EventsQuery, "key") as query:
-            with here.streams.listening(query.names, query.keys, credential_of(line)) as news:
-                await _send(line, news, here)
+    async def socket(line: WebSocket, query: Annotated[EventsQuery, Query()], here: Here) -> None:
+        with here.streams.listening(query.names, query.keys, credential_of(line)) as news:
+            await _send(line, news, here)
 
 
 _texts: WeakKeyDictionary[Published, tuple[str, float]] = WeakKeyDictionary()

@@ -24,7 +24,6 @@ from mastctl.as_json import as_json
 from mastctl.control.entry import CAMERA_SETTINGS
 from mastctl.frame_facts import described_headers, headers_of
 from mastctl.http import PREFIX
-from mastctl.http.refusals import query_of
 from mastctl.report.pictures import encoded
 from mastctl.web.commands import Here, Parts, command, file_of
 from mastctl.web.events import UNSUPPORTED, close_ended, credential_of
@@ -61,14 +60,13 @@ def add_images(app: FastAPI) -> None:
         return await waiting.image(camera, picture, kept=frame_id is not None)
 
     @app.websocket(IMAGES)
-    async def socket(line: WebSocket, here: Here) -> None:
-        async with query_of(line, ImagesQuery, "camera") as query:
-            for camera in query.camera:
-                here.service.check_camera(camera)
-            with here.streams.listening((), frozenset(), credential_of(line)) as ending:
-                await line.accept()
-                with here.feeds.viewer(query.camera, not query.on_request, query.every) as viewer:
-                    await _Line(here, line, viewer).run(asyncio.ensure_future(ending.wait()))
+    async def socket(line: WebSocket, query: Annotated[ImagesQuery, Query()], here: Here) -> None:
+        for camera in query.camera:
+            here.service.check_camera(camera)
+        with here.streams.listening((), frozenset(), credential_of(line)) as ending:
+            await line.accept()
+            with here.feeds.viewer(query.camera, not query.on_request, query.every) as viewer:
+                await _Line(here, line, viewer).run(asyncio.ensure_future(ending.wait()))
 
 
 def add_cameras(app: FastAPI) -> None:

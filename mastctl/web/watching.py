@@ -32,7 +32,7 @@ def add_watching(app: FastAPI) -> None:
     @app.get(f"{PREFIX}/health/live", summary="Whether requests are answered: they are")
     async def live(request: Request, here: Here) -> answers.LiveAnswer:
         access = here.entrance.access
-        if access is None or not from_this_machine(request.scope, request.headers):
+        if access is None or not from_this_machine(request):
             return {"live": True}
         return {"live": True, "token_folder": access.folder}
 
@@ -68,10 +68,10 @@ def add_sessions(app: FastAPI) -> None:
 
     @app.post(f"{PREFIX}/session", summary="Keep the token of this request in the page's cookie")
     async def keep(request: Request, response: Response, here: Here) -> answers.ClientSession:
-        token, _ = shown_token(request.scope, request.headers)
+        token = shown_token(request)
         if here.entrance.access is not None and token is not None:
             response.set_cookie(
-                cookie_name(request.scope),
+                cookie_name(request),
                 token,
                 max_age=COOKIE_S,
                 path="/",
@@ -83,7 +83,7 @@ def add_sessions(app: FastAPI) -> None:
 
     @app.delete(f"{PREFIX}/session", summary="Forget the page's cookie")
     async def forget(request: Request, response: Response, here: Here) -> answers.ClientSession:
-        response.delete_cookie(cookie_name(request.scope), path="/", httponly=True, samesite="strict")
+        response.delete_cookie(cookie_name(request), path="/", httponly=True, samesite="strict")
         return _session(request, here)
 
 

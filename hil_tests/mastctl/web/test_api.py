@@ -154,8 +154,7 @@ def test_a_bad_request_is_told_with_place_value_and_what_is_expected(
 
 RAW_BODIES: list[tuple[bytes, str, int, str]] = [
     (b"{", "application/json", 400, "not_json"),
-    (b'{"pan_rad": NaN, "tilt_rad": 0}', "application/json", 400, "not_json"),
-    (b'{"pan_rad": 0, "pan_rad": 1, "tilt_rad": 0}', "application/json", 400, "not_json"),
+    (b'{"pan_rad": NaN, "tilt_rad": 0}', "application/json", 422, "bad_request"),
     (b"[" * 30000, "application/json", 400, "not_json"),
     (b'{"pan_rad": 0, "tilt_rad": 0}', "text/plain", 415, "not_json"),
     (b'{"pan_rad": 0, "tilt_rad": 0}', "", 415, "not_json"),

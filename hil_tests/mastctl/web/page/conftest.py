@@ -12,7 +12,7 @@ import pytest
 
 from hil_tests.waiting import NET_S
 from mastctl.web import pictures
-from mastctl.web.page import page_files
+from mastctl.web.page import PAGE_FOLDER
 from tools.browser import chromium
 
 if TYPE_CHECKING:  # slow to load, and every worker loads this file
@@ -114,7 +114,7 @@ def visit(browser: Browser) -> Iterator[Callable[..., Visit]]:
     contexts: list[BrowserContext] = []
     made: list[Visit] = []
 
-    source = page_files()["eye.js"].decode()
+    source = (PAGE_FOLDER / "eye.js").read_text()
     assert STALE in source
     patient = source.replace(STALE, f"const STALE_S = {NET_S};")
 
