@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -39,11 +39,15 @@ class BadMastFile(BadRequest):
 
 @dataclass(frozen=True, eq=False)
 class MastInUse:
-    """A mast file as read, and its bytes: what the file holds later does not matter."""
+    """A mast file as read, and its bytes: what the file holds later does not matter.
+
+    ``rig`` is its part that is configured.
+    """
 
     stored: StoredRig
     data: bytes
     path: Path
+    rig: Rig
 
     def as_json(self) -> MastAnswer:
         """Return its file, name and digest as JSON."""
@@ -55,7 +59,7 @@ def read_mast(path: Path, config: Config) -> MastInUse:
     data = read_bytes(path, MAX_BYTES)
     stored = parse_rig(data, path)
     check_cameras(config, stored.rig)
-    return MastInUse(stored, data, path)
+    return MastInUse(stored, data, path, _configured(stored.rig, config))
 
 
 def read_next(name: str, config: Config, now: MastInUse, sensor_modes: Mapping[str, SensorMode]) -> MastInUse:
@@ -82,7 +86,7 @@ def read_next(name: str, config: Config, now: MastInUse, sensor_modes: Mapping[s
         raise BadMastFile(str(error)) from None
     for camera in config.hardware.cameras:
         _check_camera(camera, stored, now.stored)
-    found = MastInUse(stored, data, path)
+    found = MastInUse(stored, data, path, _configured(stored.rig, config))
     if stored.digest != now.stored.digest:  # the one in use is no change, whatever joined since
         _check_modes(found, sensor_modes)
     return found
@@ -99,9 +103,9 @@ def _check_modes(mast: MastInUse, sensor_modes: Mapping[str, SensorMode]) -> Non
                 raise BadMastFile(f"{mast.path.name}: {error}") from None
 
 
-def configured(rig: Rig, cameras: Iterable[str]) -> Rig:
+def _configured(rig: Rig, config: Config) -> Rig:
     """Return the part of a rig that is configured: nothing is aimed with an absent camera."""
-    names = set(cameras)
+    names = set(config.hardware.cameras)
     fit = {key: value for key, value in rig.fit.items() if key not in ("parameters", "covariance")}
     try:
         known = stored_covariance(rig)

@@ -10,15 +10,12 @@ import logging
 import math
 import random
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from calib.files.mast_file import StoredRig
-from calib.geometry.rigid import FloatArray
 from calib.matching.handoff import MatchedHandoff
 from drivers.clock import Clock, SystemClock
 from drivers.hardware import Hardware, clock_for, head_name
@@ -26,7 +23,6 @@ from drivers.simulation_clock import SimulationClock
 from mastctl.answers import (
     CameraAnswer,
     EstopAnswer,
-    KeptTarget,
     MeasuredJoints,
     PanoramaDrawn,
     Status,
@@ -61,8 +57,7 @@ from mastctl.drift.watch import DriftWatch
 from mastctl.errors import MastctlError, NotNow
 from mastctl.motion.jog import Jogs
 from mastctl.motion.requests import wrong_camera
-from mastctl.motion.search import in_picture
-from mastctl.motion.track import ACTIVE, RoverPose, Tracker, TrackStatus
+from mastctl.motion.track import RoverPose, Tracker, TrackStatus
 from mastctl.panorama.compose import drawn
 from mastctl.panorama.panoramas import Panoramas
 from mastctl.recorder.entries import AttachedMast
@@ -72,9 +67,9 @@ from mastctl.safety import stop_socket
 from mastctl.safety.latch import Latch
 from mastctl.safety.state_folder import StateFolder, head_folders
 from mastctl.safety.stop_socket import StopSocket, Verb
-from mastctl.service.masts import MastInUse, Masts, configured, read_mast
+from mastctl.service.masts import MastInUse, Masts, read_mast
 from mastctl.service.metrics import Metrics
-from mastctl.service.places import places, targets
+from mastctl.service.places import Targets, places
 from mastctl.service.steering import Steering
 from mastctl.service.stopping import Stopping, StopThreads, state_faults
 
@@ -113,21 +108,14 @@ class Service:
         self.started_s = clock.now_s()
         self._version = version("mastctl")
         self.folder = folder
-        self.places, self.targets = places(self.folder.path), targets(self.folder.path)
+        self.places = places(folder.path)
         self.head_folder = head
         self.latch = Latch(head or folder, [*head_folders(head_name(config.hardware)), folder.path])
         self.machine = StateMachine(clock, latched=self.latch.entries)
         publisher = self.machine.publisher
         self.journals = JournalThread(clock)
-        self.drift = DriftWatch(
-            self.folder.path,
-            config.tracking.handoff_log,
-            mast.stored,
-            lambda digest: self.panoramas.slip(digest),
-            self.journals,
-            clock,
-        )
         self._open_head(mast)
+        self.targets = Targets(folder.path, self.masts, self.tracker, self.operations)
         publisher.publish("track", "track", self.tracker.status)
         self.stop_threads = StopThreads()
         self.recorder = Recorder(
@@ -170,7 +158,6 @@ class Service:
         self.devices.watch_faults(self._own_faults)
         self.stop_socket: StopSocket | None = None
         self._socket_folder: StateFolder | None = None
-        self._closing = threading.Lock()
         self._closed = False
 
     def _open_head(self, mast: MastInUse) -> None:
@@ -188,12 +175,11 @@ class Service:
             config.sun,
             machine,
         )
-        rig = configured(mast.stored.rig, config.hardware.cameras)
         self.operations = OperationRunner(self.devices, clock, new_run(), self._ended, machine)
         self.tracker = Tracker(
             self.operations,
             self.devices,
-            rig,
+            mast.rig,
             config.limits,
             clock,
             config.tracking,
@@ -205,14 +191,21 @@ class Service:
         self.panoramas = Panoramas(
             self.folder.path,
             self.masts.unchanged,
-            lambda: self.steering.rig,
+            lambda: self.masts.in_use.rig,
             self.devices,
             clock,
             self.operations,
         )
+        self.drift = DriftWatch(  # which measures at once what it is given
+            self.folder.path,
+            config.tracking.handoff_log,
+            mast.stored,
+            self.panoramas.slip,
+            self.journals,
+            clock,
+        )
         self.steering = Steering(
             self.masts,
-            rig,
             self.devices,
             clock,
             self.operations,
@@ -305,40 +298,6 @@ class Service:
         """Return the track, as it is or was, as ``GET /track`` has it."""
         return (status or self.tracker.status).as_json(self.clock.now_s())
 
-    def keep_target(self, name: str, body: Any) -> dict[str, KeptTarget]:
-        """Keep a target by a name and return all; in the site frame, if a pose is known.
-
-        Raises NotKnown, NotNow if the operation measured no position, or the rover moved since.
-        """
-        position_m, frame, covariance_m2 = body.position_m, body.frame, body.covariance_m2
-        if body.operation is not None:
-            record, moved_s = self.operations.get(body.operation).as_json(), self.tracker.moved_s
-            position_m, frame = record["position_m"], "rover"
-            if position_m is None or (moved_s is not None and moved_s > record["created_s"]):
-                why = "measured no position" if position_m is None else "was before the rover moved"
-                raise NotNow("no_position", f"operation {body.operation} {why}; another pointing is expected")
-            measured = [one["detail"] for one in record["steps"] if one["name"] == "triangulate"]
-            covariance_m2 = measured[-1].get("covariance_m2") if measured else None
-        pose = self.tracker.pose
-        if frame == "rover" and pose is not None:
-            frame, turned = "site", pose.site_from_rover
-            position_m = turned.points(np.array(position_m)).tolist()
-            if covariance_m2 is not None:
-                covariance_m2 = (turned.rotation @ np.array(covariance_m2) @ turned.rotation.T).tolist()
-        one = {"position_m": position_m, "frame": frame, "covariance_m2": covariance_m2}
-        return self.targets.keep(name, one)
-
-    def targets_in(self, frame: StampedFrame) -> dict[str, dict[str, float]]:
-        """Return where a frame shows the kept targets, by name, as `track_in` has one."""
-        if frame.mast_digest != self.stored.digest:
-            return {}
-        camera = self.stored.rig.camera_in_rover(frame.camera, *frame.true_rad)
-        shown: dict[str, dict[str, float]] = {}
-        for name, position, covariance in self._targets_in_rover():
-            if (place := in_picture(camera, position, covariance)) is not None:
-                shown[name] = place
-        return shown
-
     def panorama_drawn(self, name: str) -> PanoramaDrawn:
         """Return what is drawn over a panorama; targets only while the rover stands where it was taken.
 
@@ -351,31 +310,7 @@ class Service:
         now = rig.camera_in_rover(camera, *reading.true_rad) if reading and camera in rig.cameras else None
         moved_s = self.tracker.moved_s
         stands = moved_s is None or moved_s <= self.panoramas.began_s(name)
-        return drawn(folder, now, {k: at for k, at, _ in self._targets_in_rover()} if stands else {})
-
-    def _targets_in_rover(self) -> Iterator[tuple[str, FloatArray, Any]]:
-        """The kept targets in the rover frame of now: name, position, covariance."""
-        pose = self.tracker.pose
-        for name, one in self.targets.known.items():
-            position, covariance = np.array(one["position_m"]), one["covariance_m2"]
-            if one["frame"] == "site" and pose is not None:
-                here = pose.site_from_rover.inverse
-                position = here.points(position)
-                if covariance is not None:
-                    covariance = here.rotation @ np.array(covariance) @ here.rotation.T
-            yield name, position, covariance
-
-    def track_in(self, frame: StampedFrame) -> dict[str, float] | None:
-        """Return where a frame should show the track's target, pixels, with one sigma as an ellipse.
-
-        None without a target, or where the frame does not show it. The ellipse has half axes ``major_px`` and
-        ``minor_px``, the first turned by ``turn_rad`` from x towards y.
-        """
-        status, stored = self.tracker.status, self.stored
-        if status.state not in ACTIVE or status.position_m is None or frame.mast_digest != stored.digest:
-            return None
-        camera = stored.rig.camera_in_rover(frame.camera, *frame.true_rad)
-        return in_picture(camera, status.position_m, status.covariance_m2)
+        return drawn(folder, now, {k: at for k, at, _ in self.targets.in_rover()} if stands else {})
 
     def snapshot(self, camera: str, fresh: bool) -> StampedFrame:
         """Return a frame exposed after this call (``fresh``), or one that is at most a second old.
@@ -425,10 +360,9 @@ class Service:
 
     def close(self) -> None:
         """Stop the mast and let go of everything; bounded, never raises."""
-        with self._closing:
-            if self._closed:
-                return
-            self._closed = True
+        closed, self._closed = self._closed, True
+        if closed:
+            return
         folders = self.folder, self.head_folder, self._socket_folder
         maybe = (self.stop_socket, self.journals, self.latch, *folders)
         first_to_last: tuple[Callable[[], object], ...] = (
@@ -469,10 +403,8 @@ class Service:
     def _use_mast(self, mast: MastInUse) -> None:
         """Have every part use another mast file."""
         stored = mast.stored
-        rig = configured(stored.rig, self.config.hardware.cameras)
         self.devices.use_rig(stored.rig, stored.digest)
-        self.steering.rig = rig
-        self.tracker.use_rig(rig, mast.path.name)
+        self.tracker.use_rig(mast.rig, mast.path.name)
         self.drift.use_mast(stored)
 
     def _steered(self) -> None:

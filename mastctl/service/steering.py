@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
-from calib.geometry.rig import Rig
 from drivers.clock import Clock
 from mastctl.answers import Preview
 from mastctl.control.operations import Operation, OperationRunner
@@ -60,7 +59,6 @@ class Steering:
     def __init__(
         self,
         masts: Masts,
-        rig: Rig,
         devices: Devices,
         clock: Clock,
         operations: OperationRunner,
@@ -76,7 +74,6 @@ class Steering:
         self._operations = operations
         self._tracker = tracker
         self._drift = drift
-        self.rig = rig
         self._settings = PointingSettings()
         if repeat_after_s is not None:
             self._settings = replace(self._settings, repeat_after_s=repeat_after_s)
@@ -132,8 +129,8 @@ class Steering:
         with self._masts.unchanged():
             request = self._in_rover(request)
             if request.pixel is not None:
-                check_known(request.pixel.camera, self.rig.cameras)
-                check_pair(request.pixel.camera, self.rig, self._masts.in_use.stored.rig)
+                check_known(request.pixel.camera, self._masts.in_use.rig.cameras)
+                check_pair(request.pixel.camera, self._masts.in_use.rig, self._masts.in_use.stored.rig)
                 self._check_digest(request.pixel)
                 self._check_pixel(request.pixel)
             return self._tracker.start(request, recorded)
@@ -168,7 +165,9 @@ class Steering:
     def _loop(self) -> Callable[[Callable[[Any], None], threading.Event], PointingLoop]:
         """Return what makes a pointing by the mast file and the limits of now."""
         limits = self._devices.judge.limits
-        return partial(PointingLoop, self.rig, self._devices, limits, self._clock, self._settings)
+        return partial(
+            PointingLoop, self._masts.in_use.rig, self._devices, limits, self._clock, self._settings
+        )
 
     def _in_rover(self, request: R) -> R:
         """Return a request in the rover frame of now; before a pose, site and rover are one."""
@@ -184,7 +183,7 @@ class Steering:
         if request.angles_rad is not None:
             self._devices.judge.check_goal(*request.angles_rad)
         if request.aim is not None:
-            aim_of(request, self.rig)
+            aim_of(request, self._masts.in_use.rig)
 
     def _check_digest(self, target: PixelTarget) -> None:
         taken_with, in_use = target.mast_digest, self._masts.in_use.stored.digest
@@ -195,7 +194,7 @@ class Steering:
             raise NotNow("other_mast_file", message)
 
     def _check_pixel(self, target: PixelTarget) -> None:
-        frame = clicked_frame(target, self.rig, self._devices.store.by_id)
+        frame = clicked_frame(target, self._masts.in_use.rig, self._devices.store.by_id)
         age_s = self._clock.now_s() - frame.mid_exposure_s
         if age_s > CLICK_AGE_S:
             message = f"frame {frame.frame_id} is {age_s:.0f} s old, at most {CLICK_AGE_S:.0f} s is allowed"

@@ -144,8 +144,8 @@ class _Line:
         height, width = frame.image.shape[:2]
         age_s = max(0.0, self._here.service.clock.now_s() - frame.mid_exposure_s)
         facts = as_json(frame.facts) | {"size_px": [width, height], "reduced": picture.reduced}
-        facts |= {"age_s": age_s, "sent_s": _now_s(), "track": self._here.service.track_in(frame)}
-        if targets := self._here.service.targets_in(frame):
+        facts |= {"age_s": age_s, "sent_s": _now_s(), "track": self._here.service.targets.track_in(frame)}
+        if targets := self._here.service.targets.shown_in(frame):
             facts["targets"] = targets
         head = json.dumps(facts, allow_nan=False).encode()
         return b"".join((len(head).to_bytes(4, "little"), head, picture.jpeg))

@@ -91,7 +91,7 @@ def add_targets(app: FastAPI) -> None:
     @command(app, "POST /targets/{name}", TARGET_KEEP)
     def keep(name: PlaceName, body: TargetBody, here: Here) -> TargetList:
         """Keep a target by a name."""
-        return {"targets": here.service.keep_target(name, body)}
+        return {"targets": here.service.targets.keep_measured(name, body)}
 
     @command(app, "DELETE /targets/{name}", TARGET_FORGET)
     def forget(name: PlaceName, here: Here) -> TargetList:

@@ -336,7 +336,7 @@ def test_a_target_is_kept_drawn_and_goes_into_the_site(client: Client, daemon: R
     kept = client.targets()["rock"]
     assert kept["frame"] == "site" and kept["position_m"] == pytest.approx([3.0, 0.2, -0.1])
     client.wait(client.point(position_m=(3.0, 0.2, -0.1)))
-    shown = daemon.service.targets_in(daemon.service.snapshot("navcam_left", True))["rock"]
+    shown = daemon.service.targets.shown_in(daemon.service.snapshot("navcam_left", True))["rock"]
     assert abs(shown["x_px"] - 199.5) < 3 and abs(shown["y_px"] - 149.5) < 3
     assert shown["major_px"] > shown["minor_px"] > 0.0
     assert client.request("DELETE", "/targets/rock") == {"targets": {}}

@@ -33,7 +33,7 @@ def test_what_is_not_known_of_a_camera_yet_is_null() -> None:
     assert set(camera_answer(None, 100.0).values()) == {None}
 
 
-@pytest.mark.parametrize("part", ["handoffs", "recorder", "audit"])
+@pytest.mark.parametrize("part", ["drift", "recorder", "audit"])
 def test_each_own_fault_is_published_and_in_the_status(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, part: str
 ) -> None:
