@@ -24,7 +24,6 @@ from calib.plan.poses import (
     expected_px,
     readings,
     rover_from_board,
-    shown,
     with_board,
 )
 from calib.survey.records import Survey
@@ -52,9 +51,6 @@ CELLS = (8, MOST_CELLS // 8)
 
 LEAST_PX, LEAST_SCALE = 0.01, 0.1
 """No corner is surer than this, and none so much surer than its finder says; few pictures agree by chance."""
-
-BESIDE, BESIDE_AT_FIRST = 0.1, 0.5
-"""So far outside a picture, in parts of its width, corners may be in it after all: after, before a fit."""
 
 
 class BenchKnowledge:
@@ -116,21 +112,14 @@ class BenchKnowledge:
                 counts[one.camera] = counts.get(one.camera, 0) + 1
         return max(counts.values(), default=0)
 
-    def cameras_for(self, shot: BenchShot, check: bool = False) -> tuple[str, ...]:
-        """Return the cameras whose pictures of a shot may tell something: those that point, those that may
-        see the board, and those on the body that have not seen it stand there yet."""
-        beside = BESIDE if self.fitted is not None else BESIDE_AT_FIRST
-        return tuple(
-            name
-            for name, camera in self.now.rig.cameras.items()
-            if name in self.workspace.cameras
-            or (
-                sum(name in look.cameras for look in self.of(shot.placement, check)) < STILL
-                if camera.on == "rover"
-                else shown(self.now, self.sought, shot, name, -beside * camera.model.size_px[0]).sum()
-                >= self.sought.least
-            )
-        )
+    def cameras_for(self, name: str) -> list[str]:
+        """Return the cameras whose pictures of a placement may tell something: those of the head, and those
+        on the body that have not seen it stand there yet."""
+        return [
+            camera
+            for camera, mounted in self.now.rig.cameras.items()
+            if mounted.on == "head" or sum(camera in look.cameras for look in self.of(name)) < STILL
+        ]
 
     def round_others(self, name: str) -> Iterator[BenchShot]:
         """Yield attitudes that bring a placement's board to the image's corners of each head camera that

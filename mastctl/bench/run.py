@@ -52,6 +52,10 @@ UNSEEN_IN_A_ROW = 4
 """Looks in a row without the board where it was expected: it was taken away, or has moved."""
 
 
+PLACEMENTS, CHECKS = (2, 4), 5
+"""Fewest and most placements; images that are not fitted."""
+
+
 class Reporter(Protocol):
     """Shows the operator how a run goes, and has the board placed."""
 
@@ -77,14 +81,11 @@ class BenchGoal:
     """What a run is to reach, and when it stops trying.
 
     ``pointing_px``: rms per axis of a first pointing that the calibration may leave, on paper;
-    ``pictures`` of a camera, at most, the check's among them; fewest and most ``placements``; ``checks`` that
-    are not fitted.
+    ``pictures`` of a camera, at most, the check's among them.
     """
 
     pointing_px: float = 0.2
     pictures: int = 60
-    placements: tuple[int, int] = (2, 4)
-    checks: int = 5
 
 
 class BenchRun:
@@ -138,12 +139,12 @@ class BenchRun:
         if self._current != name and not self._stands_still(name):
             self._reporter.say(f"not checked: the board does not stand any more as in placement {name}")
             return Checked({}, ())
-        left = self.wanted.checks - sum(1 for _, check, _ in known.looks if check)
+        left = CHECKS - sum(1 for _, check, _ in known.looks if check)
         for shot in unvisited(known, name, left):
             self._reporter.say(
                 f"an image that is not fitted, at pan {deg(shot.pan_rad)}, tilt {deg(shot.tilt_rad)}"
             )
-            look = self.look_at(shot, check=True)
+            look = self.look_at(shot)
             if look is not None and look.found:
                 known.take(name, look, check=True)
         checks = known.of(name, check=True)
@@ -188,7 +189,7 @@ class BenchRun:
     def _enough(self) -> bool:
         known = self.known
         over = [name for name in known.placements() if self._kept.is_over(name)]
-        if len(over) >= self.wanted.placements[1] or self._looks_left() <= 0:
+        if len(over) >= PLACEMENTS[1] or self._looks_left() <= 0:
             return True
         if not over:
             return False
@@ -198,7 +199,7 @@ class BenchRun:
             raise  # no other placement mends it
         except CalibError as reason:
             self._reporter.say(f"no fit yet: {reason}")
-        if len(over) < self.wanted.placements[0] or self._body_advice() is not None:
+        if len(over) < PLACEMENTS[0] or self._body_advice() is not None:
             return False
         return known.predicted_px() <= self._target_px()
 
@@ -209,7 +210,7 @@ class BenchRun:
 
     def _looks_left(self) -> int:
         """Looks that may still be taken for the fit."""
-        return self.wanted.pictures - self.wanted.checks - self.known.pictures()
+        return self.wanted.pictures - CHECKS - self.known.pictures()
 
     def _target_px(self) -> float:
         """What the calibration may leave: as requested, or what counts leave anyway."""
@@ -230,7 +231,7 @@ class BenchRun:
         Some are left for the other placements. Raises BenchInterrupted ``board_lost``.
         """
         known, self._current = self.known, name
-        left = max(self.wanted.placements[0] + 1 - len(known.placements()), 1)
+        left = max(PLACEMENTS[0] + 1 - len(known.placements()), 1)
         most = max(FEWEST_LOOKS, self._looks_left() // left)
         self._reporter.step("pictures")
         in_vain: list[tuple[float, float]] = []
@@ -267,10 +268,10 @@ class BenchRun:
                     known.take(name, look)
         self._end(name)
 
-    def look_at(self, shot: BenchShot, check: bool = False) -> BenchLook | None:
+    def look_at(self, shot: BenchShot) -> BenchLook | None:
         """Take a shot; None where the head must not go."""
         try:
-            return self._look(shot, self.known.cameras_for(shot, check))
+            return self._look(shot, self.known.cameras_for(shot.placement))
         except NotThere as reason:
             self._reporter.say(f"no image was taken there: {reason}")
             return None
@@ -286,9 +287,8 @@ class BenchRun:
         return self._look(then, {*self.known.workspace.cameras, *(one.camera for one in then.found)})
 
     def _look(self, where: BenchShot | BenchLook, cameras: Collection[str]) -> BenchLook:
-        at = where.pan_rad, where.tilt_rad, (where.pan_approach, where.tilt_approach)
-        every = len(cameras) == len(self.known.head.rig.cameras)
-        return self._mast.look(*at) if every else self._mast.look(*at, cameras)
+        approach = where.pan_approach, where.tilt_approach
+        return self._mast.look(where.pan_rad, where.tilt_rad, approach, cameras)
 
     def _suffices(self, taken: int, choice: AttitudeChoice) -> bool:
         if taken < FEWEST_LOOKS:
@@ -297,7 +297,7 @@ class BenchRun:
         now_px = known.predicted_px()
         if now_px <= 0.7 * self._target_px() and known.fitted_looks >= taken:
             return True
-        last = len(known.placements()) >= self.wanted.placements[1]
+        last = len(known.placements()) >= PLACEMENTS[1]
         return choice.expected_px > (1.0 - (LAST_GAIN if last else LITTLE_GAIN)) * now_px
 
     def _end(self, name: str) -> None:

@@ -217,8 +217,8 @@ def in_the_night(bench: CornerBench, whys: Sequence[str]) -> None:
     """Around the one place that is lit, ``ASIDE_RAD`` to the right, views are no good; a lamp is not seen."""
     looked, lowest = bench.look, bench.head.tilt_limits_rad[0]
 
-    def look(pan_rad: float, tilt_rad: float, approach: tuple[int, int] = (0, 0)) -> BenchLook:
-        seen = looked(pan_rad, tilt_rad, approach)
+    def look(pan_rad: float, tilt_rad: float, *rest: Any) -> BenchLook:
+        seen = looked(pan_rad, tilt_rad, *rest)
         if abs(pan_rad - ASIDE_RAD) < LIT_RAD:
             return seen
         why = whys[0] if tilt_rad > lowest else whys[-1]
