@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from calib.adjust.noise import Component, as_one
 from calib.adjust.result import BenchCalibration, Calibration, FittedRig, ImageResiduals
@@ -32,9 +31,6 @@ POINTING_BAD_PX = 2.0
 
 MANY_LEFT_OUT = 0.05
 """Share of dots or images left out above which the survey itself is in doubt."""
-
-TURNED_RAD = 2.0
-"""A mast turned further against the rover is one whose joints count the other way."""
 
 PAPER_GOOD_PX = 2.0
 """Rms of fitted images that the paper's method may leave: station errors of 2 mm are 1.4 px at 5 m."""
@@ -72,15 +68,12 @@ class Reason:
 class CalibrationVerdict:
     """The worst of the reasons decides."""
 
-    grade: Grade
     reasons: tuple[Reason, ...]
 
-    @classmethod
-    def by(cls, reasons: Iterable[Reason]) -> CalibrationVerdict:
-        """Return the verdict of some reasons."""
-        every = tuple(reasons)
-        grades = {reason.grade for reason in every}
-        return cls("bad" if "bad" in grades else "care" if "care" in grades else "good", every)
+    @property
+    def grade(self) -> Grade:
+        """The worst grade."""
+        return max((reason.grade for reason in self.reasons), key=list(ADVICE).index, default="good")
 
     @property
     def advice(self) -> str:
@@ -111,8 +104,8 @@ def judge(
         if isinstance(fit, Calibration)
         else _of_bench(survey, fit)
     )
-    return CalibrationVerdict.by(
-        [
+    return CalibrationVerdict(
+        (
             *_noise(survey, fit),
             *_contradictions(fit),
             *_checks(fit),
@@ -120,7 +113,7 @@ def judge(
             *_pointing(survey, fit),
             *own,
             *_left_out(fit),
-        ]
+        )
     )
 
 
@@ -134,9 +127,8 @@ def _of_survey(
     """The reasons that only a survey has."""
     yield from _wider(fit)
     yield from _jointly(survey, fit, jointly)
-    yield from _turned(fit)
     yield from _at_the_end(fit)
-    yield from (Reason("care", sentence) for sentence in _exchanged_boards(survey, fit))
+    yield from _other_boards(survey, fit)
     if undetected:
         yield Reason("care", f"no dots were found in {len(undetected)} images: {_some(undetected)}")
     joint = np.isfinite(fit.chi2_probability)
@@ -352,18 +344,6 @@ def _checks(fit: Calibration | BenchCalibration) -> list[Reason]:
     return reasons
 
 
-def _turned(fit: Calibration) -> list[Reason]:
-    """Whether the mast is turned about: a tilt that counts down fits as well, with the head half a turn off.
-
-    `calib.survey.diagnoses` mostly refuses such a survey before.
-    """
-    angle = float(np.linalg.norm(Rotation.from_euler("XYZ", fit.rig.mast.rotation_rad).as_rotvec()))
-    if angle < TURNED_RAD:
-        return []
-    turned = f"the mast comes out turned by {np.degrees(angle):.0f} degrees against the rover"
-    return [Reason("bad", f"{turned}: pan or tilt has the wrong sign (right and up are positive)")]
-
-
 def _inexact(survey: Survey, fit: BenchCalibration) -> Iterator[Reason]:
     """Whether corners are where the board's measures and the lenses have them, but for noise."""
     if fit.inexact_m > 0.0:
@@ -402,41 +382,33 @@ def _pointing(survey: Survey, fit: Calibration | BenchCalibration) -> Iterator[R
         yield Reason("good" if by_rig <= good else "care" if by_rig <= bad else "bad", sentence)
 
 
-def _exchanged_boards(survey: Survey, calibration: Calibration) -> Iterator[str]:
-    """A sentence for each placement whose images show another one.
+def _other_boards(survey: Survey, fit: Calibration) -> Iterator[Reason]:
+    """Placements whose images show another one of their set-up far better than their own.
 
-    Of check images and images that the fit left out, every board of their set-up is tried where the fit has
-    it.
+    Images of the check, and those that the fit left out, are tried with every board where the fit has it.
     """
-    left_out = {outlier.name for outlier in calibration.outliers if outlier.kind == "image"}
+    left_out = {outlier.name for outlier in fit.outliers if outlier.kind == "image"}
     shown: dict[tuple[str, str, str], list[str]] = {}
-    for image in calibration.images:
-        if image.purpose == "check" or f"image {image.name}" in left_out:
-            other = _shown_board(survey, calibration, image)
-            if other is not None:
-                shown.setdefault((image.setup, image.placement, other[1]), []).append(image.name)
-    for (setup, own, other_one), images in shown.items():
-        yield (
-            f"image{'s' * (len(images) > 1)} {_some(images)} cannot show placement {own} but would show "
-            f"{other_one} (set-up {setup}): are they exchanged in images.csv, or their tapes in station.csv?"
-        )
-
-
-def _shown_board(survey: Survey, calibration: Calibration, image: ImageResiduals) -> tuple[str, str] | None:
-    """The board of the same set-up that the image shows; None if none fits far better than its own."""
-    model = calibration.rig.camera_in_rover(image.camera, image.pan_rad or 0.0, image.tilt_rad or 0.0)
-    in_board = survey.board.dots_in_board_m(image.rows, image.columns)
-    own_px = float(np.sqrt(np.mean(image.residuals_px**2)))
-    best, nearest_px = None, CLOSER * own_px if np.isfinite(own_px) else FAR_PX
-    for placement, pose in calibration.rover_from_board.items():
-        if placement[0] != image.setup or placement[1] == image.placement:
+    for image in fit.images:
+        if image.purpose != "check" and f"image {image.name}" not in left_out:
             continue
-        predicted, valid = model.project(pose.points(in_board))
-        if valid.all():
-            rms_px = float(np.sqrt(np.mean((predicted - image.pixels_px) ** 2)))
-            if rms_px < nearest_px:
-                best, nearest_px = placement, rms_px
-    return best
+        model = fit.rig.camera_in_rover(image.camera, image.pan_rad or 0.0, image.tilt_rad or 0.0)
+        in_board = survey.board.dots_in_board_m(image.rows, image.columns)
+        off_px = {}
+        for (setup, placement), pose in fit.rover_from_board.items():
+            predicted, valid = model.project(pose.points(in_board))
+            if setup == image.setup and placement != image.placement and valid.all():
+                off_px[placement] = float(np.sqrt(np.mean((predicted - image.pixels_px) ** 2)))
+        own_px = float(np.sqrt(np.mean(image.residuals_px**2)))
+        other = min(off_px, key=lambda placement: off_px[placement], default=None)
+        if other is not None and off_px[other] < (CLOSER * own_px if np.isfinite(own_px) else FAR_PX):
+            shown.setdefault((image.setup, image.placement, other), []).append(image.name)
+    for (setup, own, other), images in shown.items():
+        yield Reason(
+            "care",
+            f"image{'s' * (len(images) > 1)} {_some(images)} cannot show placement {own} but would show "
+            f"{other} (set-up {setup}): are they exchanged in images.csv, or their tapes in station.csv?",
+        )
 
 
 def _left_out(fit: Calibration | BenchCalibration) -> list[Reason]:

@@ -28,6 +28,8 @@ from mastctl.client import Client, ClientError, Snapshot
 BORDER_PX = 64  # nearer the edge than this a person would turn the head first
 TRIES_PER_VIEW = 8
 RANGE_SLACK = 0.12  # share of the distance within which a target is treated as "at 10 m"
+VIEWS_PER_TARGET = 12  # a view without a usable target is left for another; then the distance is given up
+OPERATION_TIMEOUT_S, STOP_TIMEOUT_S = 60.0, 30.0
 TEXTURE_SIGMA_PX = 0.08  # how sharply texture must fix a position, one axis, at the grey noise below
 NOISE_DN = 2.0
 
@@ -71,12 +73,6 @@ def texture_mask(image: Image) -> NDArray[np.bool_]:
     mask[:BORDER_PX] = mask[-BORDER_PX:] = False
     mask[:, :BORDER_PX] = mask[:, -BORDER_PX:] = False
     return np.asarray(mask, dtype=np.bool_)
-
-
-# A view that offers no usable target is left for another; after this many in a row the distance is given up.
-VIEWS_PER_TARGET = 12
-OPERATION_TIMEOUT_S = 60.0
-STOP_TIMEOUT_S = 30.0
 
 
 @dataclass(frozen=True)
@@ -146,13 +142,8 @@ class TargetViews:
         height_m = float(head_in_rover_m[2])
         along_m = math.sqrt(max(distance_m**2 - height_m**2, 0.0))
         azimuth_rad = self.rng.uniform(-self.pan_range_rad, self.pan_range_rad)
-        return np.array(
-            [
-                head_in_rover_m[0] + along_m * math.cos(azimuth_rad),
-                head_in_rover_m[1] + along_m * math.sin(azimuth_rad),
-                0.0,
-            ]
-        )
+        ahead = along_m * np.array([math.cos(azimuth_rad), math.sin(azimuth_rad)])
+        return np.array([*(head_in_rover_m[:2] + ahead), 0.0])
 
 
 def pointed(client: Client, **request: Any) -> OperationAnswer:

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import cv2
 
@@ -51,25 +51,21 @@ def run_tasks(
     ``label`` describes a task; ``done`` is called with each and its result as they come. Raises TaskFailed
     with the first error.
     """
-    futures = {executor.submit(_one, function, task): task for task in tasks}
+    futures = {executor.submit(_result_or_error, function, task): task for task in tasks}
     for future in as_completed(futures):
-        task = futures[future]
-        try:
-            done(task, future.result())
-        except _Broke as error:
-            raise TaskFailed(f"task {label(task)}: {error}") from error
-    return [future.result() for future in futures]
+        task, (result, error) = futures[future], future.result()
+        if error:
+            raise TaskFailed(f"task {label(task)}: {error}")
+        done(task, cast(Result, result))
+    return [cast(Result, future.result()[0]) for future in futures]
 
 
-class _Broke(Exception):
-    """The error of a task, as a sentence: not every error survives between processes."""
-
-
-def _one(function: Callable[[Task], Result], task: Task) -> Result:
+def _result_or_error(function: Callable[[Task], Result], task: Task) -> tuple[Result | None, str]:
+    """A task's result, or its error as a sentence: not every error survives between processes."""
     try:
-        return function(task)
+        return function(task), ""
     except Exception as error:
-        raise _Broke(f"{type(error).__name__}: {error}") from error
+        return None, f"{type(error).__name__}: {error}"
 
 
 @contextmanager
@@ -82,17 +78,22 @@ def open_executor(name: str = "local", workers: int | None = None) -> Iterator[E
     """
     if name == "local":
         # Started afresh: the threads of a progress bar run in this process, which a fork would copy half.
-        context, processes = get_context("spawn"), workers or os.cpu_count() or 1
-        with _environment(ONE_THREAD), ProcessPoolExecutor(processes, context, _begin) as pool:
-            try:
-                yield pool
-            except BrokenExecutor as error:
-                raise TaskFailed(
-                    f"a process that ran a task died (killed, or out of memory?): {error}"
-                ) from None
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+        before = {key: os.environ.get(key) for key in ONE_THREAD}
+        os.environ.update(ONE_THREAD)
+        try:
+            with ProcessPoolExecutor(workers or os.cpu_count(), get_context("spawn"), _begin) as pool:
+                try:
+                    yield pool
+                except BaseException:
+                    pool.shutdown(cancel_futures=True)
+                    raise
+        except BrokenExecutor as error:
+            reason = f"a process that ran a task died (killed, or out of memory?): {error}"
+            raise TaskFailed(reason) from None
+        finally:
+            for key, value in before.items():
+                os.environ.pop(key)
+                os.environ.update({} if value is None else {key: value})
         return
     if not name.startswith(DASK) or name == DASK:
         raise NoExecutor(f"--executor is '{name[:80]}' where local or dask:ADDRESS is expected")
@@ -110,19 +111,6 @@ def open_executor(name: str = "local", workers: int | None = None) -> Iterator[E
         raise NoExecutor(f"no Dask scheduler answers at {address[:80]}: {error}") from None
     with client:
         yield client.get_executor()
-
-
-@contextmanager
-def _environment(values: Mapping[str, str]) -> Iterator[None]:
-    """Variables that processes started meanwhile inherit."""
-    before = dict(os.environ)
-    os.environ.update(values)
-    try:
-        yield
-    finally:
-        for name in values:
-            os.environ.pop(name)
-        os.environ.update(before)
 
 
 def _begin() -> None:

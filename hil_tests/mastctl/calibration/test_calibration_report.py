@@ -100,7 +100,9 @@ def test_the_worst_reason_decides(fitted: tuple[Survey, Calibration]) -> None:
     assert care.grade == "care"
     assert "prism p3" in care.reasons[-1].sentence
     left_open = Degenerate(("mast.translation_m.z",), "tilt hardly moved")
-    assert judge(survey, replace(calibration, degenerate=(left_open,))).grade == "bad"
+    open_survey = judge(survey, replace(calibration, degenerate=(left_open,)))
+    assert open_survey.grade == "bad"
+    assert not any("first pointing" in reason.sentence for reason in open_survey.reasons)
     noisy = replace(calibration, chi2=9.0 * calibration.degrees_of_freedom, chi2_probability=0.0)
     assert judge(survey, noisy).grade == "bad"
     off = {name: size._replace(seen_px=3.0) for name, size in calibration.checks.items()}
