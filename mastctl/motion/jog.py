@@ -4,9 +4,9 @@ A rate is carried out as moves to a goal a short way ahead: as far as the head g
 and it has braked. So whatever ends (heartbeats, this process, its machine) leaves that much motion and no
 more, and every goal passes the judge with all its limits: an axis at a bound rests while the other goes on.
 
-A heartbeat is good for half a second of the daemon's clock. One that names a jog which has ended moves
-nothing, so that none which was delayed on its way begins a motion again; nor does one without a name whose
-number shows that others went before it.
+A heartbeat is good for half a second of the daemon's clock. Heartbeats are numbered: only number 1 begins a
+jog, and one that names a jog which has ended moves nothing. So none that was delayed on its way begins a
+motion again.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import math
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
 from typing import Annotated, Any
 
 from pydantic import Field
@@ -60,15 +59,6 @@ class JogBeat(StrictBody):
         return self.pan_rad_per_s, self.tilt_rad_per_s
 
 
-@dataclass(frozen=True)
-class JogEnd:
-    """How a jog ended: why, and where the head was when it was stopped."""
-
-    ended_because: str
-    pan_rad: float
-    tilt_rad: float
-
-
 class Jogs:
     """The jog of one daemon, at most one at a time; safe to use from any thread.
 
@@ -88,8 +78,11 @@ class Jogs:
         self._devices = devices
         self._clock = clock
         self._undisturbed = undisturbed
-        self._lock = threading.Lock()
-        self._jog: tuple[str, _Jog] | None = None
+        self._changed = clock.signal()
+        self._name: str | None = None
+        self._beat = JogBeat(pan_rad_per_s=0.0, tilt_rad_per_s=0.0, sequence=1)
+        self._came_s = 0.0
+        self._bounded: Mapping[str, str] = {}
 
     def beat(self, beat: JogBeat) -> JogAnswer:
         """Take a heartbeat; return the jog's ``id``, whether it was ``taken``, and which axis does not turn.
@@ -99,89 +92,70 @@ class Jogs:
         """
         if beat.id is None:
             self._operations.let_stopped_end()
-        with self._lock:
-            if self._jog is not None and self._operations.running != self._jog[0]:
-                self._jog = None
-            name, running = self._jog or (None, None)
+        with self._changed:
+            runs = self._name is not None and self._operations.running == self._name
             if beat.id is not None:
-                if running is None or name != beat.id:
+                if not runs or self._name != beat.id:
                     message = f"jog {beat.id[:80]} does not run any more; begin another one without an id"
                     raise NotNow("jog_ended", message)
-                return running.take(beat, beat.id)
-            if name is not None:
-                raise busy(name)
+                if beat.sequence <= self._beat.sequence:
+                    return self._answer(False)
+                self._beat, self._came_s = beat, self._clock.now_s()
+                if beat.rates == STILL:
+                    self._changed.notify_all()
+                return self._answer(True)
+            if runs and self._name is not None:
+                raise busy(self._name)
             if beat.rates == STILL:
                 return {"id": None, "taken": False, "held": {}}
             if beat.sequence != 1:
                 message = f"sequence is {beat.sequence} without an id; 1 begins a jog, its answer has the id"
                 raise NotNow("jog_ended", message)
-            jog = _Jog(self._devices, self._clock, beat)
+            self._beat, self._came_s, self._bounded = beat, self._clock.now_s(), {}
             recorded = {"jog": {"pan_rad_per_s": beat.pan_rad_per_s, "tilt_rad_per_s": beat.tilt_rad_per_s}}
             with self._undisturbed():
-                begun = self._operations.start(recorded, jog.run).id
-            self._jog = begun, jog
-            return jog.answer(begun, True)
+                self._name = self._operations.start(recorded, self._run).id
+            return self._answer(True)
 
+    def _answer(self, taken: bool) -> JogAnswer:
+        return {"id": self._name, "taken": taken, "held": dict(self._bounded)}
 
-class _Jog:
-    def __init__(self, devices: Devices, clock: Clock, first: JogBeat) -> None:
-        self._devices = devices
-        self._clock = clock
-        self._changed = clock.signal()
-        self._beat = first
-        self._came_s = clock.now_s()
-        self._sent: Pair | None = None
-        self._bounded: Mapping[str, str] = {}
-
-    def take(self, beat: JogBeat, name: str) -> JogAnswer:
-        with self._changed:
-            if beat.sequence <= self._beat.sequence:
-                return self.answer(name, False)
-            self._beat, self._came_s = beat, self._clock.now_s()
-            if beat.rates == STILL:
-                self._changed.notify_all()
-        return self.answer(name, True)
-
-    def answer(self, name: str, taken: bool) -> JogAnswer:
-        return {"id": name, "taken": taken, "held": dict(self._bounded)}
-
-    def run(self, record: Callable[[Any], None], cancelled: threading.Event) -> JogEnd:
-        """Turn the head until no heartbeat comes any more; then stop it.
+    def _run(self, record: Callable[[Any], None], cancelled: threading.Event) -> dict[str, Any]:
+        """Turn the head until no heartbeat comes any more; stop it, and return why and where.
 
         Raises PointingError ``stopped``, ``head_fault``; MastctlError, DriverError if the head fails; it is
         stopped by the caller then.
         """
-        seen_s = self._clock.now_s()
+        seen_s, sent = self._clock.now_s(), None
         while True:
             if cancelled.is_set():
                 raise PointingError("stopped", "the jog was stopped")
             reading = self._devices.read()
-            now_s = self._clock.now_s()
+            now_s, rates = self._clock.now_s(), self._beat.rates
             late_s = max(now_s - self._came_s, now_s - seen_s)
-            if self._beat.rates == STILL:
-                return self._end("its client let go", reading)
-            if late_s > PATIENCE_S:
-                why = "the daemon was held up" if now_s - seen_s > PATIENCE_S else "no heartbeat came"
-                return self._end(f"{why} for {late_s:.2f} s", reading)
+            why = "its client let go" if rates == STILL else ""
+            if not why and late_s > PATIENCE_S:
+                silent = "the daemon was held up" if now_s - seen_s > PATIENCE_S else "no heartbeat came"
+                why = f"{silent} for {late_s:.2f} s"
+            if why:
+                self._devices.stop()
+                log.info("the jog ends: %s", why)
+                return {"ended_because": why, "pan_rad": reading.pan_rad, "tilt_rad": reading.tilt_rad}
             seen_s = now_s
             if reading.faults:
                 raise PointingError("head_fault", f"the head reports: {'; '.join(reading.faults)}")
-            self._step(reading)
+            sent = self._step(reading, rates, sent)
             with self._changed:
                 if self._beat.rates != STILL:
                     self._changed.wait(TICK_S, idle=True)
 
-    def _end(self, why: str, reading: Reading) -> JogEnd:
-        self._devices.stop()
-        log.info("the jog ends: %s", why)
-        return JogEnd(why, reading.pan_rad, reading.tilt_rad)
-
-    def _step(self, reading: Reading) -> None:
-        """Send the head a little further, as far as that is free."""
+    def _step(self, reading: Reading, rates: Pair, sent: Pair | None) -> Pair | None:
+        """Send the head a little further, as far as that is free; return the goal that it has."""
         judge = self._devices.judge
         start = reading.pan_rad, reading.tilt_rad
-        rates = _capped(self._beat.rates, judge.limits.speed_rad_per_s)
-        stay = self._sent or start
+        share = min(1.0, judge.limits.speed_rad_per_s / max(map(abs, rates)))  # the same direction
+        rates = rates[0] * share, rates[1] * share
+        stay = sent or start
         wanted = tuple(
             at + rate * AHEAD_S + math.copysign(judge.braking_rad(rate), rate) if rate else stays
             for at, rate, stays in zip(start, rates, stay, strict=True)
@@ -192,17 +166,10 @@ class _Jog:
             for axis, to, want, rate in zip(AXES, goal, wanted, rates, strict=True)
             if rate and abs(want - to) > 1e-6
         }
-        if goal == start or goal == self._sent:
-            return
+        if goal in (start, sent):
+            return sent
         try:
-            self._devices.move(*goal, max(abs(rate) for rate in rates))
-        except KeptOut:
-            return  # it went on since it was read; the goal that it has is free
-        self._sent = goal
-
-
-def _capped(rates: Pair, most: float) -> Pair:
-    """Rates as fast as allowed, in the same direction."""
-    fastest = max(abs(rate) for rate in rates)
-    share = min(1.0, most / fastest) if fastest else 1.0
-    return rates[0] * share, rates[1] * share
+            self._devices.move(*goal, max(map(abs, rates)))
+        except KeptOut:  # it went on since it was read; the goal that it has is free
+            return sent
+        return goal
