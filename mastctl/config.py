@@ -108,7 +108,7 @@ class Listen(Record, json_schema_extra=_ONE_OR_THE_OTHER):
 class Config:
     """A daemon's configuration; paths are absolute or relative to the working folder. ``data``: its bytes.
 
-    ``repeat_after_s``: as `mastctl.motion.settings.PointingSettings` has it, None for its default.
+    ``repeat_after_s``: as `mastctl.motion.loop.REPEAT_AFTER_S`, None for that.
     """
 
     path: Path

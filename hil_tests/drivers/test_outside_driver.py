@@ -23,7 +23,6 @@ from mastctl.devices.devices import Devices
 from mastctl.devices.judge import Limits
 from mastctl.motion.loop import PointingLoop
 from mastctl.motion.requests import PixelTarget, PointRequest
-from mastctl.motion.settings import PointingSettings
 from mastctl.setup.machine import examine_drivers
 
 LANDED_WITHIN_PX = 0.6
@@ -56,8 +55,7 @@ def test_the_pointing_loop_runs_on_it(hardware: Hardware, mast_file: Path) -> No
     steps: list[Step] = []
 
     def point(**target: Any) -> PointingResult:
-        settings, stopped = PointingSettings(), threading.Event()
-        loop = PointingLoop(stored.rig, devices, limits, clock, settings, steps.append, stopped)
+        loop = PointingLoop(stored.rig, devices, limits, clock, steps.append, threading.Event())
         return loop.run(PointRequest(**target))
 
     try:

@@ -208,7 +208,7 @@ class ScriptedLoop:
 
     script: Callable[..., Any]
 
-    def __init__(self, rig: Rig, devices: Any, *others: Any) -> None:
+    def __init__(self, rig: Rig, devices: Any, *others: Any, repeat_after_s: float) -> None:
         self._devices = devices
         *_, self._record, self._cancelled = others
 

@@ -40,10 +40,17 @@ from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.keep_out import Pair
 from mastctl.errors import MastctlError
 from mastctl.motion.measurement import CameraView, Clicked, match_facts, rounded
-from mastctl.motion.one_camera import OneCamera
+from mastctl.motion.one_camera import PIXEL_SIGMA_PX, OneCamera
 from mastctl.motion.requests import Aim, PixelTarget, PointingError, PointRequest, aim_of
 from mastctl.motion.steps import FoundAgain, Steps
 
+REPEAT_AFTER_S = 1.0
+"""How much later a second image is taken, which has to repeat a residual before it is reported; 0: none. So
+an image older than its stamp by up to that is found out: the residual was measured in one that was exposed by
+a head at rest."""
+REPEAT_SIGMAS = 3.0
+WATCHED_S = 0.05
+"""How often a head at rest is read while a moment is waited for; a stop is noticed as soon."""
 NO_PICTURE_OF_A_POSITION = "no residual: a position has no picture that could be looked for"
 CHANGED = (
     ". The scene or the rover has changed since the panorama: take another, or point by direction alone "
@@ -66,8 +73,9 @@ class PointingLoop(Steps):
     _one_camera: OneCamera | None = None
     _range_from = ""
 
-    def __init__(self, *parts: Any) -> None:
+    def __init__(self, *parts: Any, repeat_after_s: float = REPEAT_AFTER_S) -> None:
         super().__init__(*parts)
+        self._repeat_after_s = repeat_after_s
         self._pointings: list[Pointing] = []
 
     def run(self, request: PointRequest, view_rad: Pair | None = None) -> PointingResult:
@@ -216,7 +224,7 @@ class PointingLoop(Steps):
         """From the clicked pixel to a line of sight, and what is known of the range."""
         found = self.clicked(target, alone=True)
         with self.step("sight") as detail:
-            one = OneCamera(self._rig, self._settings, self._devices.reading_sigma_rad, found, request)
+            one = OneCamera(self._rig, self._devices.reading_sigma_rad, found, request)
             self._one_camera = one
             detail.update(one.facts())
             return found, one.clicked(found)
@@ -244,7 +252,7 @@ class PointingLoop(Steps):
                 )
                 detail.update(predicted_px=rounded(expected.pixel_px), **one.check(now, seen, expected))
             match_px = float(seen.sigma_px.max())
-            later, again = self.repeated(clicked, now, seen, settled, aim_px)
+            later, again = self._repeated(clicked, now, seen, settled, aim_px)
             known = expected.whole_px2(one.sight.inverse_sigma_m) + match_px**2 * np.eye(2)
             predicted = {
                 "predicted_sigma_px": np.sqrt(np.diag(known)).tolist(),
@@ -262,7 +270,7 @@ class PointingLoop(Steps):
         with self.step("triangulate") as detail:
             # the match is of one pixel of the two that are treated as equally sure
             match_px = float(seen.sigma_px.max()) / math.sqrt(2.0)
-            sigma_px = math.hypot(self._settings.triangulation_sigma_px, match_px)
+            sigma_px = math.hypot(PIXEL_SIGMA_PX, match_px)
             point = triangulate(one.camera, other.camera, one_px, seen.pixel_px, sigma_px)
             self._position_m = point.position_m
             detail.update(
@@ -298,10 +306,65 @@ class PointingLoop(Steps):
                     same_pair = {aim.camera, name} == {source, self.cameras.partner(source)}
                     found, detail[name] = self.cameras.agree(clicked, now, seen, other, same_pair)
                     confirmed.append((other, found))
-            later, again = self.repeated(clicked, now, seen, settled, aim_px)
+            later, again = self._repeated(clicked, now, seen, settled, aim_px)
             self._measured(commanded, later, aim_px, again)
             if number < pointings:
                 self._measure_again(confirmed)
+
+    def _repeated(
+        self, clicked: Clicked, first: CameraView, seen: PatchMatch, settled: HeadReading, aim_px: FloatArray
+    ) -> tuple[CameraView, PatchMatch]:
+        """Find the clicked thing in a later image of the same camera, where the first one showed it.
+
+        ``first`` and ``seen`` are the first image after the move, and where that shows it; ``settled`` is the
+        head when it had come to rest. Returns the later image and where that shows it; the first one's, if
+        the settings want no second. The record gets ``repeated_after_s``, ``apart_px`` (x, y) and
+        ``fresh_to_s``: images older than their stamps by up to that, seconds, would not have passed. 0 where
+        both are the same to the last bit, as of a camera that froze or of a replay.
+
+        Raises PointingError ``not_repeated`` if it is elsewhere by more than three sigma and what the joints
+        read between the two (a head at rest may dither by some counts), or not found; DriverError if the
+        image does not come.
+        """
+        if not self._repeat_after_s:
+            return first, seen
+        camera, began_s = first.frame.camera, first.frame.exposure_began_s
+        with self.step("repeat") as detail:
+            until_s = began_s + self._repeat_after_s
+            while (left_s := until_s - self._clock.now_s()) > 0.0:
+                self.check_not_stopped()
+                self.read()
+                self._clock.sleep(min(left_s, WATCHED_S))
+            later = self.cameras.new((camera,), until_s, settled)[camera]
+            after_s = later.frame.exposure_began_s - began_s
+            try:
+                again = self.cameras.find(clicked, later)
+            except PointingError as error:
+                message = f"{after_s:.2f} s later {camera} does not see the target any more: {error}"
+                raise PointingError("not_repeated", message) from None
+            apart_px = again.pixel_px - seen.pixel_px
+            before_px, after_px = (view.camera.project(clicked.plane.point_m)[0] for view in (first, later))
+            sigma_px = np.hypot(seen.sigma_px, again.sigma_px)
+            allowed_px = REPEAT_SIGMAS * sigma_px + np.abs(after_px - before_px)
+            if (np.abs(apart_px) > allowed_px).any():
+                raise PointingError(
+                    "not_repeated",
+                    f"{after_s:.2f} s later {camera} shows the target {apart_px[0]:+.2f}, {apart_px[1]:+.2f} "
+                    f"px elsewhere, at most {allowed_px[0]:.2f}, {allowed_px[1]:.2f} px (3 sigma) is "
+                    "expected of a head at rest. The pictures are older than their stamps ('mastctl camera "
+                    "sync' measures by how much), the mast still rings, or the target or the rover moves",
+                )
+            another = not np.array_equal(first.image, later.image)
+            proven = {
+                "repeated_after_s": round(after_s, 3),
+                "apart_px": rounded(apart_px),
+                "fresh_to_s": round(later.frame.exposure_began_s - settled.time_s, 3) if another else 0.0,
+            }
+            detail.update(camera=camera, frame_ids=[later.frame.frame_id], **match_facts(again))
+            detail.update(residual_px=rounded(again.pixel_px - aim_px), **proven)
+            evidence = self.motion_evidence
+            self.motion_evidence = {**evidence, camera: {**evidence[camera], **proven}}
+        return later, again
 
     def _measure_again(self, confirmed: Sequence[tuple[CameraView, PatchMatch]]) -> None:
         """Measure the position again in the new images, by the aiming camera and its partner.

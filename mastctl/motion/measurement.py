@@ -23,15 +23,35 @@ from calib.matching.warp import Plane, PosedImage, Relief, carry, facing_plane, 
 from drivers.errors import BadFrame, DriverError
 from mastctl.devices.devices import Devices
 from mastctl.devices.frames import StampedFrame
-from mastctl.devices.joint_history import HeadReading
+from mastctl.devices.joint_history import DITHER_RAD, HeadReading
 from mastctl.devices.keep_out import Pair
 from mastctl.motion.requests import PointingError
-from mastctl.motion.settings import PointingSettings
 
 BESIDE = "; try a pixel beside it"
 """To a person who clicked: at a rim or on bare ground a neighbour may match."""
 LEAST_OVERLAP = 0.15
 """Less of an image in common is not worth an image before the move."""
+FRAME_TIMEOUT_S = 8.0  # for a new image: some frames of a slow camera, on a busy machine
+SAME_POSE_RAD = 3e-5  # joint angles nearer than this are one pose: a tenth of a Pancam pixel
+SAME_MOMENT_S = 1e-4
+"""Exposures less apart than this are one: half a pixel would take 5000 px/s, which blurs any image."""
+BETWEEN_CAMERAS_PX = 0.5  # how far the target may move between exposures that serve a measurement
+NEAREST_M = 0.4  # nothing nearer is searched
+SEARCH_PX = 48.0
+"""Half window around the predicted place: what arrival tolerance and mast file explain in a Navcam (6 mrad
+are 8 px) with room."""
+WIDE_SEARCH_PX = 200.0
+"""The next: what a slipped encoder may do (2 degrees are 45 px in a Navcam, 120 in a Pancam)."""
+ACROSS_PX = 2.0
+"""Largest offset across the epipolar line that is still put down to calibration: the paper's mast fit leaves
+1.1 px rms."""
+RANGE_PX = 4.0  # the same along it after the move
+MATCH = MatchSettings(roughness=0.02, relief=0.01, least_lead=0.03)
+"""``roughness`` and ``relief`` decide sigmas only, and only where no second camera saw the surface. A second
+place may fit a little better than elsewhere, as along a rock's smooth edge: the prediction and the other
+camera must confirm the best."""
+SIZES = MATCH, replace(MATCH, half_px=12)
+"""The usual patch, and the one that is tried after a move where that fits nowhere."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,10 +87,8 @@ class RigCameras:
         self,
         devices: Devices,
         rig: Rig,
-        settings: PointingSettings,
         check: Callable[[], None] = lambda: None,
     ) -> None:
-        self._settings = settings
         self._devices = devices
         self._rig = rig
         self._check = check
@@ -109,10 +127,10 @@ class RigCameras:
         DriverError if a frame does not come, or cannot be used.
         """
         views = {}
-        timeout_s = self._settings.frame_timeout_s if timeout_s is None else timeout_s
+        timeout_s = FRAME_TIMEOUT_S if timeout_s is None else timeout_s
         for name, frame in self._devices.frames(names, after_s, timeout_s, self._check).items():
             apart = max(abs(frame.pan_rad - resting.pan_rad), abs(frame.tilt_rad - resting.tilt_rad))
-            if frame.moving or not apart <= self._settings.rest_tolerance_rad:
+            if frame.moving or not apart <= DITHER_RAD:
                 where = f"an image of {name} was exposed ({apart:.4f} rad off its rest)"
                 raise PointingError("head_moving", f"the head moved while {where}")
             views[name] = self.view(frame)
@@ -190,7 +208,7 @@ class RigCameras:
         detail = apart(view, others)
         moments_s = (0.0, *detail["dt_s"].values())
         spread_s = max(moments_s) - min(moments_s)
-        if spread_s <= self._settings.same_moment_s:
+        if spread_s <= SAME_MOMENT_S:
             return detail
         camera = view.frame.camera
         later = self.new((camera,), view.frame.exposure_began_s, resting)[camera]
@@ -206,11 +224,11 @@ class RigCameras:
         speed = float(np.linalg.norm(seen.pixel_px - pixel_px)) / between_s
         moved_px = speed * spread_s
         detail.update(image_speed_px_per_s=round(speed, 3), moved_px=round(moved_px, 4))
-        if moved_px >= self._settings.between_cameras_px:
+        if moved_px >= BETWEEN_CAMERAS_PX:
             raise PointingError(
                 "target_moving",
                 f"the target moves at {speed:.1f} px/s in {camera}, {moved_px:.2f} px between exposures "
-                f"{1e3 * spread_s:.1f} ms apart; less than {self._settings.between_cameras_px:g} px serves a "
+                f"{1e3 * spread_s:.1f} ms apart; less than {BETWEEN_CAMERAS_PX:g} px serves a "
                 "measurement",
             )
         return detail
@@ -222,13 +240,12 @@ class RigCameras:
 
         Raises PointingError ``not_in_view`` if the head has turned away since, ``target_...``.
         """
-        settings = self._settings
         turned = max(
             abs(view.frame.pan_rad - now.frame.pan_rad), abs(view.frame.tilt_rad - now.frame.tilt_rad)
         )
         planes = [_plane_at(view.camera, pixel_px, range_m) for range_m in (1.0, 2.0, 1e3)]
-        if turned <= settings.same_pose_rad:
-            return _good(match_patch(view, pixel_px, planes[1], now, 12.0, settings.match), now)
+        if turned <= SAME_POSE_RAD:
+            return _good(match_patch(view, pixel_px, planes[1], now, 12.0, MATCH), now)
         places = np.array([carry(pixel_px, view.camera, plane, now.camera)[0] for plane in planes])
         size = np.array(now.camera.size_px)
         if not np.isfinite(places).all() or (places[1] < 0).any() or (places[1] > size - 1).any():
@@ -238,9 +255,9 @@ class RigCameras:
                 "the pixel is out of view, click in a new image",
             )
         spread = float(np.ptp(places, axis=0).max())
-        search = min(settings.wide_search_px, settings.search_px / 2 + spread)
+        search = min(WIDE_SEARCH_PX, SEARCH_PX / 2 + spread)
         matches = [
-            match_patch(view, pixel_px, plane, now, search, settings.match)
+            match_patch(view, pixel_px, plane, now, search, MATCH)
             for plane in (planes[1], Plane(planes[1].point_m, UP))
         ]
         return _good(_best(matches), now)
@@ -250,16 +267,15 @@ class RigCameras:
 
         Raises PointingError ``target_...``, ``eyes_disagree`` if it lies off the line.
         """
-        settings = self._settings
-        found = find_partner(view, pixel_px, other, settings.nearest_m, settings.match)
+        found = find_partner(view, pixel_px, other, NEAREST_M, MATCH)
         if found.match.verdict in ("weak", "ambiguous", "flat"):
             raise _refusal(found.match, other, BESIDE)
         _good(found.match, other)
-        if abs(found.across_px) > settings.across_px + 5.0 * found.across_sigma_px:
+        if abs(found.across_px) > ACROSS_PX + 5.0 * found.across_sigma_px:
             raise PointingError(
                 "eyes_disagree",
                 f"{other.frame.camera} sees the target {found.across_px:+.2f} px off the line on which "
-                f"{view.frame.camera} puts it, at most {settings.across_px:g} px is expected{BESIDE}",
+                f"{view.frame.camera} puts it, at most {ACROSS_PX:g} px is expected{BESIDE}",
             )
         return found
 
@@ -268,16 +284,13 @@ class RigCameras:
 
         Raises PointingError ``target_...``.
         """
-        settings = self._settings
         planes = [clicked.plane, *clicked.others]
         ray = clicked.view.camera.ray(clicked.pixel_px)
         if abs(float(ray.directions @ clicked.plane.normal)) < 0.97:
             planes.append(Plane(clicked.plane.point_m, -ray.directions))  # if the slope was misjudged
-        usual = settings.match
-        sizes: tuple[MatchSettings, ...] = usual, replace(usual, half_px=settings.small_half_px)
         found: list[PatchMatch] = []
-        for search in (settings.search_px, settings.wide_search_px):
-            for plane, size in product(planes, sizes):
+        for search in (SEARCH_PX, WIDE_SEARCH_PX):
+            for plane, size in product(planes, SIZES):
                 relief = clicked.relief if plane is clicked.plane else None
                 found.append(match_patch(clicked.view, clicked.pixel_px, plane, now, search, size, relief))
                 if found[-1].verdict == "good":
@@ -297,7 +310,6 @@ class RigCameras:
 
         Raises PointingError ``eyes_disagree`` if the other camera does not confirm the place.
         """
-        settings = self._settings
         try:
             confirmed = self.find(clicked, other)
         except PointingError as error:
@@ -320,12 +332,12 @@ class RigCameras:
             "across_px": round(across_px, 3),
             "along_px": round(along_px, 3),
         }
-        if abs(across_px) > settings.across_px or (same_pair and abs(along_px) > settings.range_px):
+        if abs(across_px) > ACROSS_PX or (same_pair and abs(along_px) > RANGE_PX):
             raise PointingError(
                 "eyes_disagree",
                 f"{now.frame.camera} and {other.frame.camera} put the target {across_px:+.2f} px across and "
-                f"{along_px:+.2f} px along the epipolar line apart, at most {settings.across_px:g} px across "
-                f"and {settings.range_px:g} px along is expected",
+                f"{along_px:+.2f} px along the epipolar line apart, at most {ACROSS_PX:g} px across "
+                f"and {RANGE_PX:g} px along is expected",
             )
         return confirmed, detail
 
@@ -338,7 +350,7 @@ class RigCameras:
             return False
         camera = self._rig.camera_in_rover(name, *resting.true_rad)
         place, valid = camera.project(position_m)
-        return bool(valid) and camera.holds(place, 2.0 * self._settings.match.half_px)
+        return bool(valid) and camera.holds(place, 2.0 * MATCH.half_px)
 
 
 def apart(view: CameraView, others: Sequence[CameraView]) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Pointing with one camera: how far the clicked thing is was given, follows from a plane, or is not known.
 
 What is not known is counted with (`calib.geometry.line_of_sight`): between
-`PointingSettings.unknown_nearest_m` and infinity at first, and less after each view from elsewhere that shows
+`NEAREST_M` and infinity at first, and less after each view from elsewhere that shows
 the thing. There is no second camera that could confirm a match; instead the thing must be found near the line
 on which its range can put it.
 """
@@ -29,11 +29,15 @@ from calib.matching.patch import PatchMatch
 from calib.matching.shown_view import FLOOR_RAD
 from calib.matching.warp import Plane, facing_plane
 from mastctl.devices.keep_out import Pair
-from mastctl.motion.measurement import CameraView, Clicked, rounded
+from mastctl.motion.measurement import ACROSS_PX, CameraView, Clicked, rounded
 from mastctl.motion.requests import PointingError, PointRequest
-from mastctl.motion.settings import PointingSettings
 from mastctl.motion.steps import FoundAgain
 
+NEAREST_M = 1.0
+"""A thing of unknown range is assumed at this or farther, in 95 of 100: nearer than a mast's camera has the
+ground only looking straight down."""
+PIXEL_SIGMA_PX = 0.2
+"""Of a pixel for a position's covariance: noise and calibration. What the match shows is added."""
 RangeFrom = Literal["given", "plane", "parallax", "unknown"]
 TRIED_SIGMAS = (1.0, -1.0, 2.0)
 """Beside the likeliest range, where a thing of unknown range is searched: nearer, farther, nearer still."""
@@ -47,17 +51,14 @@ class OneCamera:
     Raises CalibError if the clicked pixel does not meet the plane that it is said to lie in, or has no ray.
     """
 
-    def __init__(
-        self, rig: Rig, settings: PointingSettings, sigma_rad: Pair, found: FoundAgain, request: PointRequest
-    ) -> None:
+    def __init__(self, rig: Rig, sigma_rad: Pair, found: FoundAgain, request: PointRequest) -> None:
         self._rig = rig
-        self._settings = settings
         self._sigma_rad = sigma_rad
         self._calibration = stored_covariance(rig)
         camera, joints = found.view.frame.camera, found.view.frame.true_rad
         pixel, now = found.clicked_px, found.now
         self.range_from: RangeFrom = "unknown"
-        inverse, sigma = self._unknown = unknown_range(settings.unknown_nearest_m)
+        inverse, sigma = self._unknown = unknown_range(NEAREST_M)
         if request.range_m is not None:
             self.range_from, inverse, sigma = "given", 1.0 / request.range_m, 0.0
         elif request.plane is not None:
@@ -104,7 +105,7 @@ class OneCamera:
             self.sight,
             now.frame.camera,
             now.frame.true_rad,
-            sigma_px=self._settings.triangulation_sigma_px,
+            sigma_px=PIXEL_SIGMA_PX,
             sigma_rad=self._sigma_rad,
             calibration=self._calibration,
         )
@@ -122,7 +123,7 @@ class OneCamera:
         beside_px = float(np.linalg.norm(off - at * along))
         model = now.camera
         focal_px = model.focal_px[0]
-        most_px = self._settings.across_px + FLOOR_RAD * focal_px
+        most_px = ACROSS_PX + FLOOR_RAD * focal_px
         if beside_px > most_px:
             raise PointingError(
                 "off_the_line",

@@ -40,7 +40,7 @@ from mastctl.devices.keep_out import KeptOut, Pair
 from mastctl.errors import MastctlError
 from mastctl.motion.measurement import CameraView, available, rounded
 from mastctl.motion.requests import PixelTarget
-from mastctl.motion.settings import HandoffRules, PointingSettings, TrackingSettings
+from mastctl.motion.settings import HandoffRules, TrackingSettings
 from mastctl.motion.steps import Steps
 
 PAIRS_TRIED = 2
@@ -123,7 +123,7 @@ class TargetSearch(Steps):
         record: Callable[[Step], None],
         cancelled: threading.Event,
     ) -> None:
-        super().__init__(rig, devices, limits, clock, PointingSettings(), record, cancelled)
+        super().__init__(rig, devices, limits, clock, record, cancelled)
         self._tracking = settings
 
     def begin_at_pixel(self, target: PixelTarget) -> tuple[Track, TrackSighting]:

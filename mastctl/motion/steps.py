@@ -14,31 +14,34 @@ import numpy as np
 from calib.geometry.pointing import Solution, ordered
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
-from calib.matching.patch import PatchMatch
 from drivers.clock import Clock
 from drivers.interfaces import AxisReport
 from mastctl.answers import Step
 from mastctl.devices.devices import Devices
-from mastctl.devices.joint_history import HeadReading, RestWatch
+from mastctl.devices.joint_history import DITHER_RAD, HeadReading, RestWatch
 from mastctl.devices.judge import Limits
 from mastctl.devices.keep_out import KeptOut, Pair
 from mastctl.motion.measurement import (
     CameraView,
-    Clicked,
     RigCameras,
     apart,
     available,
     match_facts,
-    rounded,
 )
 from mastctl.motion.requests import PixelTarget, PointingError, clicked_frame
-from mastctl.motion.settings import PointingSettings
 
 log = logging.getLogger(__name__)
 
-WATCHED_S = 0.05
-"""How often a head at rest is read while a moment is waited for; a stop is noticed as soon."""
-REPEAT_SIGMAS = 3.0
+POLL_S = 0.02  # between readings while the head moves
+DWELL_S = 0.15
+"""How long the reading must stay the same: three exposures, and longer than a mast's ringing after the axis
+reports its position reached. A reading that dithers is watched for a second."""
+ARRIVAL_TOLERANCE_RAD = 6e-3
+"""How far from the commanded angle a head may rest: three counts and half the backlash of a 12-bit servo.
+What remains is measured in the image."""
+MOVE_MARGIN_S = 4.0  # beyond distance over speed and the dwell: ramps, an approach from one side, the rest
+JUMP_RAD = 0.035  # beyond what twice the speed allows between readings: two slips of a degree
+REST_WAIT_S = 2.0  # how long a request waits for a head that still moves
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,11 +82,10 @@ class Steps:
         devices: Devices,
         limits: Limits,
         clock: Clock,
-        settings: PointingSettings,
         record: Callable[[Step], None],
         cancelled: threading.Event,
     ) -> None:
-        self.cameras = RigCameras(devices, rig, settings, self.check_not_stopped)
+        self.cameras = RigCameras(devices, rig, self.check_not_stopped)
         self.last = "request"
         self.pointing = 1
         self.motion_evidence: Mapping[str, Mapping[str, Any]] = {}
@@ -91,7 +93,6 @@ class Steps:
         self._devices = devices
         self._limits = limits
         self._clock = clock
-        self._settings = settings
         self._record = record
         self._cancelled = cancelled
         self._last_reading: HeadReading | None = None
@@ -149,7 +150,7 @@ class Steps:
             raise PointingError("head_fault", f"the head reports: {'; '.join(reading.faults)}")
         if before is not None:
             passed_s = reading.time_s - before.time_s
-            reach = 2.0 * self._limits.speed_rad_per_s * passed_s + self._settings.jump_rad
+            reach = 2.0 * self._limits.speed_rad_per_s * passed_s + JUMP_RAD
             goal = self._goal or (before.pan_rad, before.tilt_rad)
             jump = max(
                 _outside(reading.pan_rad, before.pan_rad, goal[0]),
@@ -166,10 +167,10 @@ class Steps:
 
         Raises PointingError ``head_moving`` if it still moves after ``rest_wait_s``; else as `read`.
         """
-        watch = RestWatch(0.0, self._settings.rest_tolerance_rad)
-        settled, last = self._rests(watch, self._clock.now_s() + self._settings.rest_wait_s)
+        watch = RestWatch(0.0, DITHER_RAD)
+        settled, last = self._rests(watch, self._clock.now_s() + REST_WAIT_S)
         if not settled:
-            message = f"the head still moves after {self._settings.rest_wait_s:g} s of waiting"
+            message = f"the head still moves after {REST_WAIT_S:g} s of waiting"
             raise PointingError("head_moving", f"{message}: {watch.seen()}")
         return last
 
@@ -235,10 +236,9 @@ class Steps:
 
     def time_allowed_s(self, pan_rad: float, tilt_rad: float) -> float:
         """Return the deadline of a move to these angles: distance over speed, ramps, dwell, margin."""
-        now, settings = self.read(), self._settings
+        now = self.read()
         distance = max(abs(pan_rad - now.pan_rad), abs(tilt_rad - now.tilt_rad))
-        rest_s = settings.acceleration_s + settings.dwell_s + settings.margin_s
-        return distance / self._limits.speed_rad_per_s + rest_s
+        return distance / self._limits.speed_rad_per_s + DWELL_S + MOVE_MARGIN_S
 
     def send(self, pan_rad: float, tilt_rad: float) -> None:
         """Start the move at the speed cap. Raises OutsideLimits, Stopped, DriverError."""
@@ -252,20 +252,19 @@ class Steps:
         Raises PointingError ``did_not_arrive`` with how far it is off, ``did_not_settle`` if it never rests
         before the deadline (clock time, seconds), ``stopped``; else as `read`.
         """
-        tolerance = self._settings.arrival_tolerance_rad
-        watch = RestWatch(self._settings.dwell_s, self._settings.rest_tolerance_rad)
+        watch = RestWatch(DWELL_S, DITHER_RAD)
         while True:
             settled, last = self._rests(watch, deadline_s)
             off = last.pan_rad - pan_rad, last.tilt_rad - tilt_rad
-            if settled and max(map(abs, off)) <= tolerance:
+            if settled and max(map(abs, off)) <= ARRIVAL_TOLERANCE_RAD:
                 return last
             if self._clock.now_s() < deadline_s:
-                self._clock.sleep(self._settings.poll_s)
+                self._clock.sleep(POLL_S)
                 continue  # a head that rests elsewhere may not have started yet
             where = f"pan {off[0]:+.4f} rad and tilt {off[1]:+.4f} rad from the commanded angles"
-            if max(map(abs, off)) > tolerance:
-                message = f"at its deadline the head is {where}, at most {tolerance:g} rad is expected"
-                raise PointingError("did_not_arrive", message)
+            if max(map(abs, off)) > ARRIVAL_TOLERANCE_RAD:
+                most = f"at most {ARRIVAL_TOLERANCE_RAD:g} rad is expected"
+                raise PointingError("did_not_arrive", f"at its deadline the head is {where}, {most}")
             raise PointingError(
                 "did_not_settle", f"at its deadline the head still moves, {where}: {watch.seen()}"
             )
@@ -279,7 +278,7 @@ class Steps:
                 return True, reading
             if self._clock.now_s() >= deadline_s:
                 return False, reading
-            self._clock.sleep(self._settings.poll_s)
+            self._clock.sleep(POLL_S)
 
     # The cameras
 
@@ -342,61 +341,6 @@ class Steps:
             self.cameras.check_motion(views, detail)
             self.motion_evidence = detail["motion_evidence"]
         return views
-
-    def repeated(
-        self, clicked: Clicked, first: CameraView, seen: PatchMatch, settled: HeadReading, aim_px: FloatArray
-    ) -> tuple[CameraView, PatchMatch]:
-        """Find the clicked thing in a later image of the same camera, where the first one showed it.
-
-        ``first`` and ``seen`` are the first image after the move, and where that shows it; ``settled`` is the
-        head when it had come to rest. Returns the later image and where that shows it; the first one's, if
-        the settings want no second. The record gets ``repeated_after_s``, ``apart_px`` (x, y) and
-        ``fresh_to_s``: images older than their stamps by up to that, seconds, would not have passed. 0 where
-        both are the same to the last bit, as of a camera that froze or of a replay.
-
-        Raises PointingError ``not_repeated`` if it is elsewhere by more than three sigma and what the joints
-        read between the two (a head at rest may dither by some counts), or not found; DriverError if the
-        image does not come.
-        """
-        if not self._settings.repeat_after_s:
-            return first, seen
-        camera, began_s = first.frame.camera, first.frame.exposure_began_s
-        with self.step("repeat") as detail:
-            until_s = began_s + self._settings.repeat_after_s
-            while (left_s := until_s - self._clock.now_s()) > 0.0:
-                self.check_not_stopped()
-                self.read()
-                self._clock.sleep(min(left_s, WATCHED_S))
-            later = self.cameras.new((camera,), until_s, settled)[camera]
-            after_s = later.frame.exposure_began_s - began_s
-            try:
-                again = self.cameras.find(clicked, later)
-            except PointingError as error:
-                message = f"{after_s:.2f} s later {camera} does not see the target any more: {error}"
-                raise PointingError("not_repeated", message) from None
-            apart_px = again.pixel_px - seen.pixel_px
-            before_px, after_px = (view.camera.project(clicked.plane.point_m)[0] for view in (first, later))
-            sigma_px = np.hypot(seen.sigma_px, again.sigma_px)
-            allowed_px = REPEAT_SIGMAS * sigma_px + np.abs(after_px - before_px)
-            if (np.abs(apart_px) > allowed_px).any():
-                raise PointingError(
-                    "not_repeated",
-                    f"{after_s:.2f} s later {camera} shows the target {apart_px[0]:+.2f}, {apart_px[1]:+.2f} "
-                    f"px elsewhere, at most {allowed_px[0]:.2f}, {allowed_px[1]:.2f} px (3 sigma) is "
-                    "expected of a head at rest. The pictures are older than their stamps ('mastctl camera "
-                    "sync' measures by how much), the mast still rings, or the target or the rover moves",
-                )
-            another = not np.array_equal(first.image, later.image)
-            proven = {
-                "repeated_after_s": round(after_s, 3),
-                "apart_px": rounded(apart_px),
-                "fresh_to_s": round(later.frame.exposure_began_s - settled.time_s, 3) if another else 0.0,
-            }
-            detail.update(camera=camera, frame_ids=[later.frame.frame_id], **match_facts(again))
-            detail.update(residual_px=rounded(again.pixel_px - aim_px), **proven)
-            evidence = self.motion_evidence
-            self.motion_evidence = {**evidence, camera: {**evidence[camera], **proven}}
-        return later, again
 
 
 def _counts(axis: AxisReport) -> dict[str, Any]:

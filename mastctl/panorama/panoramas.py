@@ -24,7 +24,6 @@ from mastctl.devices.devices import Devices
 from mastctl.devices.frames import StampedFrame, check_known
 from mastctl.errors import BadRequest, NotKnown, NotNow, Unable
 from mastctl.motion.requests import PanoramaTarget, PixelTarget, PointRequest
-from mastctl.motion.settings import PointingSettings
 from mastctl.panorama.compose import Seen, picture_at, so_far
 from mastctl.panorama.folder import INDEX, SCHEMA, Folder, Index, ViewRecord
 from mastctl.panorama.take import PanoramaTaker, grid_of
@@ -96,7 +95,7 @@ class Panoramas:
                 raise Unable("unwritable", str(error)) from None
 
         def run(record: Callable[[Any], None], cancelled: threading.Event) -> Any:
-            parts = rig, self._devices, limits, self._clock, PointingSettings(), record, cancelled
+            parts = rig, self._devices, limits, self._clock, record, cancelled
             result = PanoramaTaker(*parts).take(folder, self._devices)
             self._newest = folder.index
             return result

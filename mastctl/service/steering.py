@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -16,7 +15,7 @@ from mastctl.devices.frames import check_known
 from mastctl.devices.judge import Limits
 from mastctl.drift.watch import DriftWatch
 from mastctl.errors import NoLonger, NotNow, Stopped
-from mastctl.motion.loop import PointingLoop
+from mastctl.motion.loop import REPEAT_AFTER_S, PointingLoop
 from mastctl.motion.requests import (
     PixelTarget,
     PointRequest,
@@ -25,7 +24,6 @@ from mastctl.motion.requests import (
     check_pair,
     clicked_frame,
 )
-from mastctl.motion.settings import PointingSettings
 from mastctl.motion.track import ACTIVE, RoverPose, Tracker
 from mastctl.panorama.panoramas import Panoramas
 from mastctl.service.masts import Masts
@@ -52,8 +50,8 @@ class Steering:
     """Where the head is sent, and the target that it follows; safe to use from any thread.
 
     ``masts`` keeps the mast file the same while a request is judged and begun; ``rig`` is its part that is
-    configured; ``drift`` gets each pointing's end. ``repeat_after_s``: as of
-    `mastctl.motion.settings.PointingSettings`; None for its default.
+    configured; ``drift`` gets each pointing's end. ``repeat_after_s``:
+    `mastctl.motion.loop.REPEAT_AFTER_S` of another length; None for that.
     """
 
     def __init__(
@@ -74,9 +72,7 @@ class Steering:
         self._operations = operations
         self._tracker = tracker
         self._drift = drift
-        self._settings = PointingSettings()
-        if repeat_after_s is not None:
-            self._settings = replace(self._settings, repeat_after_s=repeat_after_s)
+        self._repeat_after_s = REPEAT_AFTER_S if repeat_after_s is None else repeat_after_s
 
     def point(self, request: PointRequest, recorded: Mapping[str, Any]) -> Operation:
         """Start a pointing operation and return its first record; ``recorded`` is the request as it came.
@@ -165,9 +161,8 @@ class Steering:
     def _loop(self) -> Callable[[Callable[[Any], None], threading.Event], PointingLoop]:
         """Return what makes a pointing by the mast file and the limits of now."""
         limits = self._devices.judge.limits
-        return partial(
-            PointingLoop, self._masts.in_use.rig, self._devices, limits, self._clock, self._settings
-        )
+        rig, wait_s = self._masts.in_use.rig, self._repeat_after_s
+        return partial(PointingLoop, rig, self._devices, limits, self._clock, repeat_after_s=wait_s)
 
     def _in_rover(self, request: R) -> R:
         """Return a request in the rover frame of now; before a pose, site and rover are one."""

@@ -26,9 +26,8 @@ from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.judge import Limits
 from mastctl.devices.keep_out import Pair
 from mastctl.errors import NotKnown
-from mastctl.motion.loop import PointingLoop
+from mastctl.motion.loop import REPEAT_AFTER_S, PointingLoop
 from mastctl.motion.requests import PixelTarget, PointRequest
-from mastctl.motion.settings import PointingSettings
 
 SIZE_PX = (300, 240)
 MAST_M = np.array([0.34, 0.0, -1.46])
@@ -242,11 +241,11 @@ def run(
     request: PointRequest,
     believed: Rig | None = None,
     cancelled: threading.Event | None = None,
-    settings: PointingSettings | None = None,
+    repeat_after_s: float = REPEAT_AFTER_S,
 ) -> tuple[PointingResult, list[Step]]:
     """Run a request and return its result and steps."""
     steps: list[Step] = []
-    return loop_of(world, steps, believed, cancelled, settings).run(request), steps
+    return loop_of(world, steps, believed, cancelled, repeat_after_s).run(request), steps
 
 
 def loop_of(
@@ -254,13 +253,13 @@ def loop_of(
     steps: list[Step],
     believed: Rig | None = None,
     cancelled: threading.Event | None = None,
-    settings: PointingSettings | None = None,
+    repeat_after_s: float = REPEAT_AFTER_S,
     limits: Limits = LIMITS,
 ) -> PointingLoop:
     """A request's loop, whose steps come to a list."""
     stopped = cancelled or threading.Event()
-    settings = settings or PointingSettings()
-    return PointingLoop(believed or rig(), world, limits, world.clock, settings, steps.append, stopped)
+    parts = believed or rig(), world, limits, world.clock, steps.append, stopped
+    return PointingLoop(*parts, repeat_after_s=repeat_after_s)
 
 
 def click(frame: StampedFrame, x_px: float, y_px: float, **more: object) -> PointRequest:

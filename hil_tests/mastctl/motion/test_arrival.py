@@ -17,14 +17,9 @@ from mastctl.devices.joint_history import HeadReading
 from mastctl.devices.judge import Limits
 from mastctl.devices.keep_out import KeptOut
 from mastctl.motion.requests import PointingError
-from mastctl.motion.settings import PointingSettings
 from mastctl.motion.steps import Steps
 
 SPEED_RAD_PER_S = 0.5
-SETTINGS = PointingSettings(
-    poll_s=0.02, dwell_s=0.15, arrival_tolerance_rad=6e-3, acceleration_s=1.5, margin_s=2.5,
-    jump_rad=0.035, rest_wait_s=2.0,
-)  # fmt: skip
 
 
 class Turning:
@@ -56,7 +51,7 @@ class Turning:
 def request(turning: Turning, cancelled: threading.Event | None = None) -> Steps:
     limits, stopped = Limits((-2.0, 2.0), (-1.0, 1.0), SPEED_RAD_PER_S), cancelled or threading.Event()
     steps: list[Any] = []
-    return Steps(rig(), turning, limits, turning.clock, SETTINGS, steps.append, stopped)  # type: ignore[arg-type]
+    return Steps(rig(), turning, limits, turning.clock, steps.append, stopped)  # type: ignore[arg-type]
 
 
 def standing(pan_rad: float = 0.3, tilt_rad: float = -0.2) -> Turning:

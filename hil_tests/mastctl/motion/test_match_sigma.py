@@ -23,7 +23,6 @@ from mastctl.devices.frames import StampedFrame
 from mastctl.experiment.targets import texture_mask
 from mastctl.motion.measurement import CameraView, RigCameras
 from mastctl.motion.requests import PointingError
-from mastctl.motion.settings import PointingSettings
 from mastctl.packaged import config_folder
 
 TARGETS, SEEDS, RELIEF_M = 8, (1, 2), 0.5
@@ -63,7 +62,7 @@ def errors_by_sigma(rig: Rig, seed: int) -> list[FloatArray]:
     rng = np.random.default_rng([seed, 0])
     drawing = Renderer(build_scene(SceneSettings(seed=seed, relief_m=RELIEF_M)), workers=1)
     views = taken(rig, drawing, rng)
-    cameras = RigCameras(None, rig, PointingSettings())  # type: ignore[arg-type]  # it takes none
+    cameras = RigCameras(None, rig)  # type: ignore[arg-type]  # it takes none
     rows, columns = np.nonzero(texture_mask(views[LEFT].frame.image))
     found: list[FloatArray] = []
     given = 0

@@ -22,7 +22,6 @@ from mastctl.answers import PointingResult
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
 from mastctl.motion.requests import Aim, PointingError, PointRequest
-from mastctl.motion.settings import PointingSettings
 
 MIDDLE_PX = (np.array(SIZE_PX) - 1) / 2
 LATE_S = 0.3
@@ -136,7 +135,7 @@ def test_a_residual_is_told_with_how_old_the_pictures_behind_it_may_be() -> None
     assert told["fresh_to_s"] == pytest.approx(
         began_s - settled["started_s"] - settled["duration_s"], abs=0.01
     )
-    once, steps = run(world, click(world.shoot(), *CLICK_PX), settings=PointingSettings(repeat_after_s=0.0))
+    once, steps = run(world, click(world.shoot(), *CLICK_PX), repeat_after_s=0.0)
     assert "repeat" not in [step["name"] for step in steps]
     assert "fresh_to_s" not in once["pointings"][0]["motion_evidence"]["navcam_left"]
 

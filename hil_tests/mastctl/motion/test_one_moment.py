@@ -9,7 +9,6 @@ from hil_tests.mastctl.motion.pointing_world import LATE_S, World, click, moving
 from mastctl.answers import Step
 from mastctl.motion.measurement import RigCameras
 from mastctl.motion.requests import PointingError
-from mastctl.motion.settings import PointingSettings
 
 
 def detail(steps: list[Step], name: str) -> dict[str, object]:
@@ -29,7 +28,7 @@ def test_eyes_that_expose_apart_measure_what_stands_still() -> None:
 
 def checked(world: World) -> dict[str, object]:
     """What the check says of a pair that is taken now."""
-    cameras = RigCameras(world, rig(), PointingSettings())  # type: ignore[arg-type]
+    cameras = RigCameras(world, rig())  # type: ignore[arg-type]
     resting = world.read()
     views = cameras.new(("navcam_left", "navcam_right"), world.clock.now_s(), resting)
     one, other = views["navcam_left"], views["navcam_right"]

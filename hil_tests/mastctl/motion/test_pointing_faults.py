@@ -27,7 +27,6 @@ from mastctl.devices.frames import StampedFrame
 from mastctl.devices.judge import Limits
 from mastctl.motion.loop import PointingLoop
 from mastctl.motion.requests import PixelTarget, PointingError, PointRequest
-from mastctl.motion.settings import PointingSettings
 from mastctl.packaged import config_folder
 
 MIDDLE_PX = ((SIZE_PX[0] - 1) / 2, (SIZE_PX[1] - 1) / 2)
@@ -148,10 +147,8 @@ class Rover:
     def point(
         self, request: PointRequest, record: Callable[[Step], None] = lambda step: None
     ) -> PointingResult:
-        settings, stopped = PointingSettings(), threading.Event()
-        return PointingLoop(self.rig, self.devices, self.limits, self.clock, settings, record, stopped).run(
-            request
-        )
+        parts = self.rig, self.devices, self.limits, self.clock, record, threading.Event()
+        return PointingLoop(*parts).run(request)
 
     def _first_frame(self) -> StampedFrame:
         """Return a frame of the left camera, which refuses calls until a driver that hung has returned."""

@@ -26,7 +26,6 @@ from hil_tests.mastctl.motion.pointing_world import (
 from mastctl.answers import Step
 from mastctl.as_json import as_json
 from mastctl.motion.requests import Aim, PixelTarget, PointingError, PointRequest
-from mastctl.motion.settings import PointingSettings
 
 MIDDLE_PX = ((SIZE_PX[0] - 1) / 2, (SIZE_PX[1] - 1) / 2)
 MEASURED_PX = 0.1  # the measured residual against the true one
@@ -58,14 +57,16 @@ def test_a_clicked_pixel_lands_on_the_aim_and_the_residual_is_the_true_one(
         assert max(pointing["residual_sigma_px"]) < MEASURED_PX
 
 
-def test_a_position_is_as_sure_as_the_pixels_and_the_match_behind_it() -> None:
+def test_a_position_is_as_sure_as_the_pixels_and_the_match_behind_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Of range, by hand: the disparity's sigma (two pixels, and the match) times r² / (f b)."""
     for pixel_sigma_px in (0.2, 0.02):
         world = World()
         frame = world.shoot()
-        settings = PointingSettings(triangulation_sigma_px=pixel_sigma_px)
+        monkeypatch.setattr("mastctl.motion.loop.PIXEL_SIGMA_PX", pixel_sigma_px)
         steps: list[Step] = []
-        loop_of(world, steps, settings=settings).run(click(frame, 150.0, 120.0))
+        loop_of(world, steps).run(click(frame, 150.0, 120.0))
         frames, stereo, place = (
             next(s["detail"] for s in steps if s["name"] == name)
             for name in ("frames", "stereo", "triangulate")

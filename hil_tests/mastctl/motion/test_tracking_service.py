@@ -32,7 +32,6 @@ from mastctl.client import Client, ClientError
 from mastctl.daemon import RunningDaemon
 from mastctl.motion import track as track_module
 from mastctl.motion.search import TrackSighting
-from mastctl.motion.settings import PointingSettings
 from mastctl.motion.steps import Steps
 
 TARGET_M = (5.0, 0.5, 0.0)
@@ -48,7 +47,7 @@ class ScriptedSearch(Steps):
     looks: list[Track]
 
     def __init__(self, rig: Any, devices: Any, limits: Any, clock: Any, settings: Any, *others: Any) -> None:
-        super().__init__(rig, devices, limits, clock, PointingSettings(), *others)
+        super().__init__(rig, devices, limits, clock, *others)
 
     def begin_at_pixel(self, target: Any) -> tuple[Track, TrackSighting]:
         with self.step("start"):

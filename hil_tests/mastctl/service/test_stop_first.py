@@ -8,7 +8,6 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -149,14 +148,6 @@ def test_a_fifth_stop_is_answered_honestly_while_four_hang(
 # Operations
 
 
-class PatientLoop(PointingLoop):
-    """A loop that would wait for a picture longer than any net."""
-
-    def __init__(self, rig: Any, devices: Any, limits: Any, clock: Any, settings: Any, *rest: Any) -> None:
-        settings = replace(settings, frame_timeout_s=2.0 * NET_S)
-        super().__init__(rig, devices, limits, clock, settings, *rest)
-
-
 def waiting_pointing(client: Client, hardware: FakeHardware, hang: Hang) -> str:
     """A pointing that waits for a picture of a camera that hangs."""
     frame_id = client.snapshot("navcam_left").frame_id
@@ -170,8 +161,9 @@ def test_a_stop_ends_a_pointing_that_waits_for_a_picture(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     hang = Hang()
+    monkeypatch.setattr("mastctl.motion.measurement.FRAME_TIMEOUT_S", 2.0 * NET_S)
     with (
-        fake_daemon(monkeypatch, tmp_path, loop=PatientLoop) as (daemon, hardware),  # type: ignore[arg-type]
+        fake_daemon(monkeypatch, tmp_path, loop=PointingLoop) as (daemon, hardware),  # type: ignore[arg-type]
         Client(daemon.url) as client,
     ):
         operation = waiting_pointing(client, hardware, hang)
