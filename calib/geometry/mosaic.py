@@ -191,11 +191,9 @@ def canvas_of(
         raise CalibError(
             f"{scale:g} px per radian where {LEAST_PX_PER_RAD:g} (about 1 px per degree) or more are expected"
         )
-    about_rad = _middle_rad(
-        rover_from_mosaic.inverse.vectors(
-            [camera.ray(camera.image_center_px).directions for camera in cameras]
-        )
-    )
+    scale = round(scale * math.pi / 2.0) * 2.0 / math.pi  # a whole sphere has 4 n pixels around, 2 n rows
+    ahead = [camera.ray(camera.image_center_px).directions for camera in cameras]
+    about_rad = _middle_rad(rover_from_mosaic.inverse.vectors(ahead))
     probe = Canvas(projection, scale, about_rad, 0.0, (1, 1), rover_from_mosaic, surface)
     borders = np.concatenate([probe.of_camera(camera, border(camera)) for camera in cameras])
     borders = np.concatenate([borders, _poles(cameras, probe)])

@@ -35,7 +35,7 @@ def gpano(mosaic: Picture, canvas: Canvas, path: Path) -> None:
     The middle of the sphere is straight ahead, azimuth and elevation 0. Raises BadFile.
     """
     height, width = mosaic.shape[:2]
-    full = 2 * round(math.pi * canvas.px_per_rad)
+    full = 4 * round(math.pi / 2.0 * canvas.px_per_rad)
     full_height = _full_height(canvas, full // 2)
     left, top = _corner(canvas, full, full_height)
     facts = {
@@ -76,7 +76,7 @@ def hugin(cameras: Sequence[CameraModel], files: Sequence[str], canvas: Canvas, 
     names = "vabcde"
     fov = " ".join(f"{name}{value!r}" for name, value in zip(names, lens.tolist(), strict=True))
     w, h = canvas.size_px
-    whole = 4 * math.floor(math.pi / 2.0 * canvas.px_per_rad)  # nearly a whole sphere, cropped to the mosaic
+    whole = 4 * round(math.pi / 2.0 * canvas.px_per_rad)  # cropped to the mosaic
     tall = _full_height(canvas, whole // 2)
     left, top = _corner(canvas, whole, tall)
     field = f"w{whole} h{tall} v{math.degrees(whole / canvas.px_per_rad)!r}"
