@@ -1,8 +1,8 @@
 """Requests that schemathesis makes of a daemon from its /openapi.json: as any client, then with the lease.
 
 Schemathesis makes all its checks but one: not every body of the described form is accepted, since no schema
-states which keys go together, what is in reach, or which ids exist. Left out are the two endless streams
-(/events, /track/stream) and /health/ready, whose 503 is an answer. Random requests latch emergency stops,
+states which keys go together, what is in reach, or which ids exist. Left out are the endless stream
+/events and /health/ready, whose 503 is an answer. Random requests latch emergency stops,
 take leases and set faults, for which most later ones would be refused: these are undone twice a second.
 Then the holder of the lease sends bodies of the described form, so that commands are carried out.
 """
@@ -22,8 +22,8 @@ from mastctl.control.lease import LONGEST_S
 from mastctl.http import PREFIX
 
 LEFT_OUT = ("positive_data_acceptance",)
-UNASKED = f"^{PREFIX}/(events|track/stream|health/ready)$"
-UNASKED_AS_HOLDER = f"^{PREFIX}/(events|track/stream|health/ready|stop|estop|lease.*)$"
+UNASKED = f"^{PREFIX}/(events|health/ready)$"
+UNASKED_AS_HOLDER = f"^{PREFIX}/(events|health/ready|stop|estop|lease.*)$"
 DEADLINE_S = 20.0
 TAKEN_BACK_EACH_S = 0.5
 

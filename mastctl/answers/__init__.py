@@ -5,7 +5,6 @@ They are plain dictionaries whose keys a type checker knows. Each key is there u
 Others may come later.
 """
 
-from mastctl.answers.bench import *  # noqa: F403
 from mastctl.answers.keeping import *  # noqa: F403
 from mastctl.answers.motion import *  # noqa: F403
 from mastctl.answers.status import *  # noqa: F403

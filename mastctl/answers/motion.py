@@ -4,12 +4,14 @@ of the stream, whose values are answers of routes.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, NotRequired
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, NotRequired
 
 from annotated_types import Len
 from typing_extensions import TypedDict
 
-from mastctl.answers.bench import BenchRunRecord
+from mastctl.answers.keeping import BenchRunRecord
 from mastctl.answers.status import (
     Angles,
     Count,
@@ -30,6 +32,7 @@ from mastctl.answers.status import (
     StateFacts,
     TrackState,
 )
+from mastctl.frame_facts import FrameFacts
 
 
 class Step(TypedDict):
@@ -225,7 +228,7 @@ class Handover(TypedDict):
 
 
 class TrackAnswer(TypedDict):
-    """``GET /track``, and each event of ``GET /track/stream``."""
+    """``GET /track``."""
 
     sequence: Count
     state: TrackState
@@ -270,23 +273,10 @@ class StateAnswer(StateFacts):
     moving: bool
 
 
-class FrameAnswer(TypedDict):
+@dataclass(frozen=True)
+class FrameAnswer(FrameFacts):
     """The facts of a camera's newest frame, without its picture."""
 
-    frame_id: str
-    camera: str
-    sequence: Count
-    mid_exposure_s: float
-    exposure_s: float
-    pan_rad: float
-    tilt_rad: float
-    moving: bool
-    mast_digest: str
-    true_pan_rad: float
-    true_tilt_rad: float
-    pan_approach: float
-    tilt_approach: float
-    settings: dict[str, float | None]
     age_s: Seconds
 
 
@@ -312,94 +302,30 @@ class CommandAnswer(TypedDict):
     code: NotRequired[str | None]
 
 
-class _Event(TypedDict):
-    """``sequence`` grows with each event; ``lost``: how many this listener was too slow to get, so far."""
+class Event(TypedDict):
+    """One event of ``/events``, with the newest ``value`` of its topic and key, by `EVENT_VALUES`.
 
+    ``key``: of an operation its id, of a fault or a frame the device's name. ``sequence`` grows with each
+    event; ``lost``: how many this listener was too slow to get, so far.
+    """
+
+    topic: str
     key: str
     sequence: Count
     lost: Count
+    value: Any
 
 
-class StateEvent(_Event):
-    """The state changed."""
-
-    topic: Literal["state"]
-    value: StateAnswer
-
-
-class JointsEvent(_Event):
-    """The head was read."""
-
-    topic: Literal["joints"]
-    value: HeadAnswer
-
-
-class OperationEvent(_Event):
-    """An operation began, made a step, or ended; ``key`` is its id."""
-
-    topic: Literal["operation"]
-    value: OperationAnswer
-
-
-class TrackEvent(_Event):
-    """The track changed."""
-
-    topic: Literal["track"]
-    value: TrackAnswer
-
-
-class FaultEvent(_Event):
-    """All that is wrong with one device now; ``key`` is its name."""
-
-    topic: Literal["fault"]
-    value: list[FaultAnswer]
-
-
-class FrameEvent(_Event):
-    """A camera took a picture; ``key`` is its name."""
-
-    topic: Literal["frame"]
-    value: FrameAnswer
-
-
-class MastEvent(_Event):
-    """Another mast file is in use."""
-
-    topic: Literal["mast"]
-    value: MastAnswer
-
-
-class CommandEvent(_Event):
-    """A command was carried out or refused, or what it began has ended."""
-
-    topic: Literal["command"]
-    value: CommandAnswer
-
-
-class LeaseEvent(_Event):
-    """The lease changed hands, or was renewed."""
-
-    topic: Literal["lease"]
-    value: LeaseAnswer
-
-
-class BenchEvent(_Event):
-    """A bench calibration went on, asks for a placement, or has ended."""
-
-    topic: Literal["bench"]
-    value: BenchRunRecord
-
-
-Event = (
-    StateEvent
-    | JointsEvent
-    | OperationEvent
-    | TrackEvent
-    | FaultEvent
-    | FrameEvent
-    | MastEvent
-    | CommandEvent
-    | LeaseEvent
-    | BenchEvent
-)
-"""One event of ``/events``, distinguished by its ``topic``."""
+EVENT_VALUES: Mapping[str, Any] = {
+    "state": StateAnswer,
+    "joints": HeadAnswer,
+    "operation": OperationAnswer,
+    "track": TrackAnswer,
+    "fault": list[FaultAnswer],
+    "frame": FrameAnswer,
+    "mast": MastAnswer,
+    "command": CommandAnswer,
+    "lease": LeaseAnswer,
+    "bench": BenchRunRecord,
+}
+"""What the events of each topic have as their value; of a fault, all that is wrong with the device."""

@@ -418,7 +418,7 @@ def _watched(client: Client) -> BenchRunRecord:
     sentences: list[str] = []
     placement, pictures = "", 0
     for event in client.events("bench"):
-        run: BenchRunRecord = event["value"]  # type: ignore[assignment]
+        run: BenchRunRecord = event["value"]
         both = min(len(sentences), len(run["sentences"]))
         known = max(n for n in range(both + 1) if sentences[len(sentences) - n :] == run["sentences"][:n])
         for sentence in run["sentences"][known:]:

@@ -11,17 +11,17 @@ import threading
 from collections.abc import Callable
 from functools import cache
 from importlib.metadata import version
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, Union
 
 from fastapi import FastAPI, Response
 from fastapi.responses import JSONResponse
 from fastapi.routing import APIRoute
 from fastapi.utils import create_model_field
-from pydantic import Field, TypeAdapter
+from pydantic import BaseModel, Field, TypeAdapter, create_model
 from starlette.types import ASGIApp, Receive, Scope, Send
 from typing_extensions import get_type_hints, is_typeddict
 
-from mastctl.answers import ErrorBody, Event, TrackAnswer
+from mastctl.answers import EVENT_VALUES, Count, ErrorBody
 from mastctl.http.guard import Guard
 from mastctl.http.refusals import JsonAnswer, add_errors
 from mastctl.web.commands import REFERENCE, Here, Parts
@@ -106,9 +106,15 @@ def _made(app: FastAPI) -> bytes:
                 route.response_field = create_model_field(kind.__name__, kind, mode="serialization")
                 route.response_description = (kind.__doc__ or kind.__name__).strip().splitlines()[0]
     document = app.openapi()
-    one = Field(discriminator="topic", title="Event", description="One event of ``/events``.")
-    streamed: dict[str, Any] = {"Event": Annotated[Event, one], "TrackAnswer": TrackAnswer}
-    for name, streams in streamed.items():
-        schema = TypeAdapter(streams).json_schema(mode="serialization", ref_template=REFERENCE)
-        document["components"]["schemas"] |= schema.pop("$defs", {}) | {name: schema}
+    events = [_event(topic, kind) for topic, kind in EVENT_VALUES.items()]
+    event: Any = Annotated[Union[*events], Field(discriminator="topic")]
+    schema = TypeAdapter(event).json_schema(mode="serialization", ref_template=REFERENCE)
+    document["components"]["schemas"] |= schema.pop("$defs", {}) | {"Event": schema}
     return bytes(JSONResponse(document).body)
+
+
+def _event(topic: str, kind: Any) -> type[BaseModel]:
+    """The model of a topic's events, by `mastctl.answers.Event`."""
+    count = (Count, ...)
+    fields: dict[str, Any] = {"topic": (Literal[topic], ...), "key": (str, ...), "sequence": count}
+    return create_model(f"{topic.title()}Event", **fields, lost=count, value=(kind, ...))

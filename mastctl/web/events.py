@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterator, Sequence
 from typing import Annotated
 from weakref import WeakKeyDictionary
 
@@ -35,11 +35,9 @@ AGES_HOLD_S = 0.02  # for how long a text that has an age is sent to other liste
 AGELESS: frozenset[Topic] = frozenset({"operation", "mast", "command", "bench"})
 """Topics whose values have no age."""
 
-AsText = Callable[[Service, Published, int], str]
-
 
 def add_events(app: FastAPI) -> None:
-    """The event stream, and the track's own."""
+    """The event stream."""
 
     @app.get(
         EVENTS,
@@ -48,16 +46,7 @@ def add_events(app: FastAPI) -> None:
         responses=stream_of("Event"),
     )
     async def events(query: Annotated[EventsQuery, Query()], here: Here) -> StreamingResponse:
-        return _Lines(here, query.names, query.keys, _event)
-
-    @app.get(
-        f"{PREFIX}/track/stream",
-        summary="The track as server-sent events: now, and at each change",
-        response_class=StreamingResponse,
-        responses=stream_of("TrackAnswer"),
-    )
-    async def track(here: Here) -> StreamingResponse:
-        return _Lines(here, ("track",), None, _track)
+        return _Lines(here, query)
 
     @app.websocket(EVENTS)
     async def socket(line: WebSocket, query: Annotated[EventsQuery, Query()], here: Here) -> None:
@@ -78,22 +67,16 @@ def _event(service: Service, one: Published, lost: int) -> str:
     return f'{head[:-1]}, "value": {known[0]}}}'
 
 
-def _track(service: Service, one: Published, lost: int) -> str:
-    return json.dumps(writable(service.track_answer(one.value)), allow_nan=False)
-
-
 class _Lines(StreamingResponse):
     """Events as server-sent ones, until the daemon or the client ends."""
 
-    def __init__(
-        self, here: Parts, topics: tuple[Topic, ...], keys: frozenset[str] | None, as_text: AsText
-    ) -> None:
+    def __init__(self, here: Parts, query: EventsQuery) -> None:
         super().__init__(self._lines(), media_type="text/event-stream")
-        self._here, self._topics, self._keys, self._as_text = here, topics, keys, as_text
+        self._here, self._query = here, query
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        credential = credential_of(HTTPConnection(scope))
-        with self._here.streams.listening(self._topics, self._keys, credential) as self._news:
+        query, credential = self._query, credential_of(HTTPConnection(scope))
+        with self._here.streams.listening(query.names, query.keys, credential) as self._news:
             await super().__call__(scope, receive, send)
 
     async def _lines(self) -> AsyncIterator[str]:
@@ -102,7 +85,7 @@ class _Lines(StreamingResponse):
             found = await news.wait(ALIVE_S)
             for some in _by_few(found):
                 await self._here.waiting.turn()
-                lines = [(one.sequence, self._as_text(self._here.service, one, news.lost)) for one in some]
+                lines = [(one.sequence, _event(self._here.service, one, news.lost)) for one in some]
                 yield "".join(f"id: {number}\ndata: {text}\n\n" for number, text in lines)
             if not found:
                 if news.closed:
