@@ -42,14 +42,6 @@ def may_read_stdin() -> bool:
         return False
 
 
-def can_ask() -> bool:
-    """Return whether a person at a terminal can see a question on stderr and answer it on stdin."""
-    try:
-        return sys.stdin.isatty() and sys.stderr.isatty() and may_read_stdin()
-    except (ValueError, AttributeError):  # a stream is closed
-        return False
-
-
 def write_from_background() -> None:
     """Let a job in the background write to its terminal whatever ``stty tostop`` says."""
     signal.signal(signal.SIGTTOU, signal.SIG_IGN)

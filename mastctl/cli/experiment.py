@@ -22,12 +22,11 @@ from mastctl.cli.rig import HEADS, SPEED, WIRE
 
 if TYPE_CHECKING:
     from mastctl.client import Client
-    from mastctl.experiment.pointing import ClickTruth, PointingExperiment, TargetRecord
+    from mastctl.experiment.pointing import ClickTruth, TargetRecord
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-DEFAULT_DISTANCES_M = (10.0, 6.0, 2.0)
 STUDIES = {
     "handoff": "hand targets over from Pancam to Navcam to Hazcam and measure the errors",
     "approach": "follow a rock from 10 m to 1 m on the simulated rover, beside the paper's Table I",
@@ -44,7 +43,13 @@ TASKS = Group(
     title="tasks",
     about="where they run (docs/how-to/simulation.md)",
 )
-SEED = option("--seed SEED", "chooses views and pixels", default=1)
+"""Options of a campaign or study whose cases are tasks: `results_of`."""
+
+TARGETS = (
+    option("--targets N", "targets at each distance", default=3),
+    option("--seed SEED", "chooses views and pixels", default=1),
+    option("--distances M...", "ranges in metres", default=[10.0, 6.0, 2.0]),
+)
 
 
 def study_of(argv: Sequence[str]) -> tuple[str, list[str]] | None:
@@ -79,58 +84,20 @@ for _name, _summary in STUDIES.items():
 @command(
     "experiment pointing",
     *DAEMON,
-    option("--targets N", "targets at each distance", default=10),
-    SEED,
+    *TARGETS,
     option("--out DIR", "folder for report.html, targets.csv and record.json; none is written without"),
-    option("--distances M...", "ranges in metres", default=list(DEFAULT_DISTANCES_M)),
-    option(
-        "--simulated", "on the packaged simulated rover, a fresh one for each target, compared with the truth"
-    ),
-    option(f"--head {HEADS}", "with --simulated: the simulated head (default ptu_d46_70)"),
-    TASKS,
     help="point at random textured targets and measure the residuals",
     example="--targets 20 --out pointing",
 )
-def run_pointing(args: argparse.Namespace) -> Answer:
-    """Run the experiment on the daemon that --url or --config names, or on simulated rovers of its own."""
+def _pointing(args: argparse.Namespace) -> Answer:
     check_folder(args.out, "--out")
-    check_place(args)
-    if args.simulated:
-        return _run_simulated(args)
-    if args.head is not None:
-        raise WrongUse("--head belongs to --simulated; a running daemon has its own head")
     with client_of(args) as client:
-        return _report(args, _run(args, client, tuple(args.distances), None, ()))
-
-
-def _run_simulated(args: argparse.Namespace) -> Answer:
-    """Run each target on a simulated rover of its own."""
-    from mastctl.experiment.pointing_report import PICTURES_PER_DISTANCE
-    from mastctl.experiment.simulated import PointingTask, Rover, joined_pointings, one_pointing
-
-    rover = Rover(args.head or HEADS.split("|")[0], args.seed)
-    shown = PICTURES_PER_DISTANCE if args.out is not None else 0
-    tasks = [
-        PointingTask(rover, distance_m, index, index < shown)
-        for distance_m in dict.fromkeys(args.distances)
-        for index in range(args.targets)
-    ]
-    parts = results_of(
-        args,
-        "pointing",
-        one_pointing,
-        tasks,
-        lambda task: f"{task.distance_m:g} m, target {task.index}",
-        lambda part: part.records[0].error,
-        found=lambda part: _residuals(part.records[0]),
-    )
-    return _report(args, joined_pointings(parts))
+        return _run(args, client, None, ())
 
 
 @command(
     "demo",
-    option("--targets N", "targets at each distance", default=3),
-    SEED,
+    *TARGETS,
     option("--out DIR", "folder for the report", default=Path("mastctl_demo")),
     option(
         "--config FILE",
@@ -141,7 +108,7 @@ def _run_simulated(args: argparse.Namespace) -> Answer:
     SPEED,
     example="--out demo",
 )
-def run_demo(args: argparse.Namespace) -> Answer:
+def _demo(args: argparse.Namespace) -> Answer:
     """Start a simulated rover behind a daemon on a free port, and run the experiment on it."""
     from drivers.simulation_clock import MAX
     from mastctl.client import Client
@@ -167,57 +134,40 @@ def run_demo(args: argparse.Namespace) -> Answer:
         assert rover is not None  # both configurations are of simulated rovers
         rig = daemon.service.stored.rig
         camera = head_pair(rig, set(config.hardware.cameras))[0]
-        notes = (head_note(rover, rig, camera),)
         behind = f" behind {args.wire} bytes" if args.wire else ""
         output.tell(f"simulated rover at {daemon.url}, head {rover.settings.head.name}{behind}")
-        experiment = _run(args, client, DEFAULT_DISTANCES_M, simulation_truth(rover), notes)
-    return _report(args, experiment)
+        return _run(args, client, simulation_truth(rover), (head_note(rover, rig, camera),))
 
 
 def _run(
-    args: argparse.Namespace,
-    client: Client,
-    distances_m: tuple[float, ...],
-    truth: ClickTruth | None,
-    notes: tuple[str, ...],
-) -> PointingExperiment:
-    """Run with a progress bar on stderr, one step a target."""
-
+    args: argparse.Namespace, client: Client, truth: ClickTruth | None, notes: tuple[str, ...]
+) -> Answer:
+    """Run, with a progress bar on stderr, and write the report if it is wanted; 1 if no target landed."""
     from mastctl.experiment.pointing import run_pointing_experiment
-    from mastctl.experiment.pointing_report import PICTURES_PER_DISTANCE
+    from mastctl.experiment.pointing_report import (
+        PICTURES_PER_DISTANCE,
+        pointing_table,
+        write_pointing_report,
+    )
 
-    with run_bar(args, "pointing", args.targets * len(distances_m)) as step:
+    with run_bar(args, "pointing", args.targets * len(args.distances)) as step:
 
         def show(record: TargetRecord) -> None:
             where = f"{record.distance_m:g} m, target {record.index}"
-            doing, failure = (
-                f"pointing at {record.distance_m:g} m",
-                record.error and f"{where}: {record.error}",
-            )
-            step(doing, failure, f"{where}: {_residuals(record)}")
+            left = (f"{x:+.2f}, {y:+.2f} px" for x, y in (one.residual_px for one in record.landings))
+            found = f"{where}: {record.range_m:.2f} m away, residual {', then '.join(left)}"
+            step(f"pointing at {record.distance_m:g} m", record.error and f"{where}: {record.error}", found)
 
-        return run_pointing_experiment(
+        experiment = run_pointing_experiment(
             client,
             targets=args.targets,
-            distances_m=distances_m,
+            distances_m=tuple(args.distances),
             seed=args.seed,
             truth=truth,
             notes=notes,
             on_target=show,
             pictures=PICTURES_PER_DISTANCE if args.out is not None else 0,
         )
-
-
-def _residuals(record: TargetRecord) -> str:
-    """The residuals of the pointings at a target, in one line."""
-    left = (f"{x:+.2f}, {y:+.2f} px" for x, y in (landing.residual_px for landing in record.landings))
-    return f"{record.range_m:.2f} m away, residual " + ", then ".join(left)
-
-
-def _report(args: argparse.Namespace, experiment: PointingExperiment) -> Answer:
-    """Write the report if it is wanted; 1 if no target at all landed."""
-    from mastctl.experiment.pointing_report import pointing_table, write_pointing_report
-
     page = None if args.out is None else write_pointing_report(experiment, args.out)
     shown = Shown(
         f"Pointing residuals, rms px ({experiment.camera}, {experiment.status.get('hardware')} hardware)",
@@ -228,21 +178,6 @@ def _report(args: argparse.Namespace, experiment: PointingExperiment) -> Answer:
     return Answer(document, shown, 0 if any(record.landings for record in experiment.records) else 1)
 
 
-def check_place(args: argparse.Namespace) -> None:
-    """Refuse options of a running daemon beside --simulated, and of tasks without it. Raises WrongUse."""
-    if args.simulated:
-        for name in ("url", "config", "lease"):
-            if getattr(args, name) is not None:
-                raise WrongUse(f"--{name} names a running daemon; --simulated starts rovers of its own")
-        return
-    for name, usual in (("executor", "local"), ("workers", None)):
-        if getattr(args, name) != usual:
-            raise WrongUse(
-                f"--{name} belongs to --simulated, which runs simulated rovers of its own; a running daemon "
-                "is one mast, and its targets come one after another"
-            )
-
-
 def results_of(
     args: argparse.Namespace,
     name: str,
@@ -250,18 +185,17 @@ def results_of(
     tasks: Sequence[Task],
     label: Callable[[Task], str] = str,
     failure: Callable[[Result], str] = lambda _: "",
-    found: Callable[[Result], str] = lambda _: "",
 ) -> list[Result]:
     """Run a command's tasks as its options say, with a progress bar of this ``name`` on stderr.
 
-    ``failure`` returns why a result is a failure, ``found`` a line for one that is none; either is shown as
-    it comes, unless it is empty. The rest as `mastctl.experiment.tasks.run_tasks`.
+    ``failure`` returns why a result is a failure, which is shown as it comes, or an empty text. The rest as
+    `mastctl.experiment.tasks.run_tasks`.
     """
     from mastctl.experiment.tasks import open_executor, run_tasks
 
     def ended(task: Task, result: Result) -> None:
-        reason, line = failure(result), found(result)
-        step("", reason and f"{label(task)}: {reason}", line and f"{label(task)}: {line}")
+        reason = failure(result)
+        step("", reason and f"{label(task)}: {reason}")
 
     with run_bar(args, name, len(tasks)) as step, open_executor(args.executor, args.workers) as executor:
         return run_tasks(executor, function, tasks, label, ended)

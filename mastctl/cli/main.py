@@ -43,7 +43,7 @@ OVERVIEW: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "reset": ("daemon", "release an emergency stop; nothing moves by that"),
     },
     "geometry, on files": {
-        "camera": ("camera_files cameras requests", "camera files, and cameras on this machine"),
+        "camera": ("geometry cameras requests", "camera files, and cameras on this machine"),
         "solve": ("geometry", "the true joint angles that bring a target onto a pixel"),
         "triangulate": ("geometry", "the point that a stereo pair sees, with covariance"),
         "handoff": ("geometry", "where a target seen by one stereo pair falls in another"),
@@ -53,7 +53,7 @@ OVERVIEW: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "board": ("board", "a board to calibrate with: make one, measure it, find it"),
         "calibrate": ("calibrate", "fit a mast file to a survey; 'calibrate bench': to a board"),
         "calibrate bench": ("calibrate", ""),
-        "conform": ("conform", "accept a rig through its running daemon"),
+        "conform": ("rig", "accept a rig through its running daemon"),
     },
     "a rig of your own": {
         "rig": (

@@ -1,4 +1,4 @@
-"""A rig of one's own: ``rig new`` of what is plugged in, ``rig sim new``, ``rig doctor``, and ``schema``."""
+"""A rig of one's own: made (``rig new``, ``rig sim new``), examined, accepted (``conform``)."""
 
 from __future__ import annotations
 
@@ -6,27 +6,21 @@ import argparse
 import json
 import re
 import sys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from mastctl import signals
 from mastctl.cli import output
-from mastctl.cli.options import at_least, command, finite_number, option
+from mastctl.cli.options import at_least, command, one_of, option, positive_number
 from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, check_folder
 
 if TYPE_CHECKING:
     from drivers.registry import ProbedHead
     from mastctl.answers import Status
+    from mastctl.conform.rig import Check, CheckOutcome
 
 HEADS = "ptu_d46_70|dynamixel_x|ph42"
+OUTCOMES = {"passed": "ok", "failed": "FAILED", "skipped": "-"}
 MARKS = {"good": "✓", "unsure": "?", "bad": "✗"}
-QUESTIONS: tuple[tuple[Any, ...], ...] = (
-    ("height", "height of the axes over the ground, m", 1.0),
-    ("baseline", "distance of the two cameras, m", 0.1),
-    ("view_deg", "the cameras' view across, degrees", 60.0),
-    ("pan_deg", "how far pan may turn, degrees", -85.0, 85.0),
-    ("tilt_deg", "how far tilt may turn, degrees", -40.0, 30.0),
-)
-"""Options of ``rig new``, their questions to a person, and what is usual."""
 TWIN = "no head and no camera is plugged in: this is the simulated twin, which runs"
 
 
@@ -48,11 +42,11 @@ def _port(text: str) -> str:
     ),
     option("--pan-id ID", "the servo that turns pan", type=at_least(0)),
     option("--tilt-id ID", "the servo that turns tilt", type=at_least(0)),
-    option("--pan-deg LOW HIGH", "how far pan may turn, degrees (default -85 85)"),
-    option("--tilt-deg LOW HIGH", "how far tilt may turn, degrees (default -40 30)"),
-    option("--height M", "of the axes over the ground (default 1)"),
-    option("--baseline M", "between the two cameras (default 0.1)"),
-    option("--view-deg DEG", "the cameras' view across (default 60)"),
+    option("--pan-deg LOW HIGH", "how far pan may turn, degrees", default=[-85.0, 85.0]),
+    option("--tilt-deg LOW HIGH", "how far tilt may turn, degrees", default=[-40.0, 30.0]),
+    option("--height M", "of the axes over the ground", default=1.0),
+    option("--baseline M", "between the two cameras", default=0.1),
+    option("--view-deg DEG", "the cameras' view across", default=60.0),
     help="query serial lines and cameras; write configuration, drawing, udev rules and next "
     "commands. Moves nothing, replaces nothing; without hardware it writes a simulated twin",
     example="rig --pan-deg -90 90 --tilt-deg -40 30",
@@ -76,10 +70,10 @@ def _new(args: argparse.Namespace) -> Answer:
     if args.port and head is None:
         raise CommandError("no_head", f"no head: {'; '.join(found.unused)}; nothing is written")
     pan_id, tilt_id = _axes(args, head)
-    (height_m,), (baseline_m,), (view_deg,), pan_deg, tilt_deg = _numbers(args)
     numbers = RigNumbers(
-        height_m, baseline_m, view_deg, pan_deg=pan_deg, tilt_deg=tilt_deg, pan_id=pan_id, tilt_id=tilt_id
-    )
+        args.height, args.baseline, args.view_deg,
+        pan_deg=tuple(args.pan_deg), tilt_deg=tuple(args.tilt_deg), pan_id=pan_id, tilt_id=tilt_id,
+    )  # fmt: skip
     simulated = head is None and not found.cameras
     if simulated:
         output.tell(TWIN)
@@ -99,24 +93,6 @@ def _new(args: argparse.Namespace) -> Answer:
     }
     written = f"written in {args.folder}: {', '.join(made.files)}"
     return Answer(document, [written, "next:", *(f"  {one}" for one in made.next)])
-
-
-def _numbers(args: argparse.Namespace) -> list[Any]:
-    """The numbers of the options; a person at a terminal answers for the others."""
-    asks, found = not args.json and signals.can_ask(), []
-    for name, question, *usual in QUESTIONS:
-        given = getattr(args, name)
-        numbers = tuple(given) if isinstance(given, list) else () if given is None else (given,)
-        while asks and not numbers:
-            sys.stderr.write(f"{question} [{' '.join(f'{one:g}' for one in usual)}]: ")
-            sys.stderr.flush()
-            try:
-                texts = sys.stdin.readline().split() or list(map(str, usual))
-                numbers = tuple(map(finite_number, texts)) if len(texts) == len(usual) else ()
-            except argparse.ArgumentTypeError as error:
-                output.tell(str(error))
-        found.append(numbers or tuple(usual))
-    return found
 
 
 def _axes(args: argparse.Namespace, head: ProbedHead | None) -> tuple[int, int]:
@@ -166,13 +142,14 @@ WIRE = option("--wire DRIVER", "drive the head through bytes by its real driver"
     option("FOLDER", "where the three files go"),
     option(
         "--from MAST.yaml",
-        "the twin of this mast file: the file is believed, the true rig drawn from its covariance",
+        "the twin of this mast file, instead of one of the numbers below: the file is believed, the true rig "
+        "drawn from its covariance",
         dest="mast_file",
     ),
-    option("--height M", "of the axes over the ground (default 1.5)"),
-    option("--baseline M", "between the two cameras (default 0.2)"),
-    option("--view-deg DEG", "the view across the picture (default 43.3)"),
-    option("--size WxH", "of the pictures (default 1024x768)", type=_size),
+    option("--height M", "of the axes over the ground", default=1.5),
+    option("--baseline M", "between the two cameras", default=0.2),
+    option("--view-deg DEG", "the view across the picture", default=43.3),
+    option("--size WxH", "of the pictures (default 1024x768)", type=_size, default=(1024, 768)),
     option(f"--head {HEADS}", "default ptu_d46_70, or that of --wire"),
     WIRE,
     SPEED,
@@ -182,8 +159,6 @@ WIRE = option("--wire DRIVER", "drive the head through bytes by its real driver"
     example="twin --height 1.9 --baseline 0.42",
 )
 def _new_simulated(args: argparse.Namespace) -> Answer:
-    import math
-
     import numpy as np
 
     from drivers.hardware import DeviceSettings, HardwareSettings, clock_for
@@ -191,9 +166,6 @@ def _new_simulated(args: argparse.Namespace) -> Answer:
     from mastctl.packaged import driver_of_hardware
     from mastctl.setup.simulated_rig import RigNumbers, built_rig, check_free, write_built, write_twin
 
-    numbers = {name: getattr(args, name) for name in ("height", "baseline", "view_deg", "size")}
-    if args.mast_file is not None and any(numbers.values()):
-        raise WrongUse("--height, --baseline, --view-deg and --size do not go with --from")
     simulation: dict[str, Any] = {"seed": args.seed, "samples": 2}
     simulation |= {
         key: getattr(args, key) for key in ("head", "wire", "speed") if getattr(args, key) is not None
@@ -210,11 +182,8 @@ def _new_simulated(args: argparse.Namespace) -> Answer:
     if args.mast_file is not None:
         twin = write_twin(args.mast_file, args.folder, simulation, args.seed)
     else:
-        usual_deg = math.degrees(2.0 * math.atan(512 / 1290.0))  # of the packaged rover's Navcams
-        drawn = RigNumbers(
-            args.height or 1.5, args.baseline or 0.2, args.view_deg or usual_deg, args.size or (1024, 768)
-        )
-        rig = built_rig(drawn, np.random.default_rng([args.seed, 1]))
+        numbers = RigNumbers(args.height, args.baseline, args.view_deg, args.size)
+        rig = built_rig(numbers, np.random.default_rng([args.seed, 1]))
         twin = write_built(rig, args.folder, simulation, args.seed)
     config = args.folder / "config.yaml"
     document = {
@@ -278,3 +247,70 @@ def _schema(args: argparse.Namespace) -> Answer | int:
         raise WrongUse(f"'{args.name}' is not a valid schema; there are {', '.join(files)}")
     sys.stdout.write(files[args.name].read_text(encoding="utf-8"))
     return 0
+
+
+@command(
+    "conform",
+    option("[URL]", "a running daemon's address"),
+    one_of(
+        option("--motion", "move the head, also a real one", default=None),
+        option("--no-motion", "only checks that move nothing", dest="motion", action="store_false"),
+    ),
+    option(
+        "--reach RAD",
+        "how far from its present pose the head is moved (default 0.3 rad)",
+        type=positive_number,
+        default=0.3,
+    ),
+    option("--only CHECK", "a check, or all of a group; may be given often", repeat=True),
+    option("--list", "only list the checks"),
+    example="http://127.0.0.1:8420",
+)
+def _conform(args: argparse.Namespace) -> Answer:
+    from mastctl.conform.rig import check_rig, rig_under_test
+    from mastctl.conform.rig_checks import RIG
+
+    checks = _chosen(RIG, args.only)
+    if args.list:
+        rows = [(check.name, "moves" if check.moves else "", check.promise) for check in checks]
+        document = {"checks": [{"name": c.name, "promise": c.promise, "moves": c.moves} for c in checks]}
+        return Answer(document, Shown("checks", ("name", "head", "what has to hold"), rows))
+    if args.url is None:
+        raise WrongUse("the address of a daemon is expected, e.g. http://127.0.0.1:8420")
+    with rig_under_test(args.url, args.reach) as rig:
+        motion = _may_move(args, checks, bool(rig.began.get("simulated")))
+        report = check_rig(rig, checks, motion, (lambda outcome: None) if args.json else _show)
+    counts = ", ".join(f"{count} {state}" for state, count in report.counts.items())
+    document = report.as_json()
+    verdict = "conforms" if document["conforms"] else "does not conform"
+    return Answer(document, f"daemon {report.subject} {verdict}: {counts}", int(not document["conforms"]))
+
+
+def _may_move(args: argparse.Namespace, checks: Sequence[Check], simulated: bool) -> bool:
+    """Whether the head may be moved: a simulated one may, any other by the options. Raises WrongUse."""
+    if args.motion is not None:
+        return bool(args.motion)
+    if not simulated and any(check.moves for check in checks):
+        moved = f"the head at {args.url} would be moved by up to {args.reach:g} rad from its present pose"
+        raise WrongUse(f"{moved}: --motion allows it, --no-motion leaves those checks out")
+    return True
+
+
+def _chosen(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
+    """The checks that --only names, by name or group; all without it. Raises WrongUse."""
+    if not names:
+        return list(checks)
+    for name in names:
+        if not any(name in (check.name, check.name.partition(".")[0]) for check in checks):
+            groups = ", ".join(dict.fromkeys(check.name.partition(".")[0] for check in checks))
+            raise WrongUse(f"--only {name}: no such check; groups are {groups}, --list shows all")
+    return [c for c in checks if c.name in names or c.name.partition(".")[0] in names]
+
+
+def _show(outcome: CheckOutcome) -> None:
+    """Show a check that has ended, in one line."""
+    promise = outcome.promise if outcome.state == "passed" else ""
+    measured = f" ({outcome.message})" if promise and outcome.message else outcome.message
+    line = output.one_line(f"{promise}{measured}")
+    sys.stdout.write(f"{OUTCOMES[outcome.state]:6} {outcome.name:22} {line}\n")
+    sys.stdout.flush()

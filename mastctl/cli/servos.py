@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import re
 import signal
-import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import closing
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,8 +16,6 @@ from mastctl.cli.options import GROUPS, at_least, command, one_of, option
 from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, tables_of
 
 if TYPE_CHECKING:
-    from drivers.clock import Clock
-    from drivers.faults import FaultPanel
     from drivers.registry import UnitBench
     from drivers.servo_bus.bench import ServoBench
     from drivers.sim.axis import WireAxis
@@ -32,6 +30,7 @@ GROUPS |= {
 
 REPLY_TIMEOUT_S = 0.05
 WHOLE = at_least(0)
+WIRE_ID = re.compile(r"([\w-]+):(\d{1,3})", re.ASCII)
 LINE = (
     option("PORT", "serial device, or a URL such as socket://host:port"),
     option("--family DRIVER", "of the servos on it (default: the first of the drivers)"),
@@ -94,17 +93,8 @@ def _scan(args: argparse.Namespace) -> Answer:
         bauds = ", ".join(str(baud) for baud in result.bauds)
         why = "; ".join(garbled) or f"is its power on, is it a {bench.family} servo?"
         raise CommandError("no_servo", f"no servo answered on {args.port} at {bauds} baud; {why}")
-    rows = [
-        {
-            "id": servo.servo_id,
-            "baud": servo.baud,
-            "model": servo.model,
-            "model_number": servo.model_number,
-            "firmware": servo.firmware,
-            "hardware_errors": list(servo.hardware_errors),
-        }
-        for servo in result.found
-    ]
+    names = ("baud", "model", "model_number", "firmware", "hardware_errors")
+    rows = [{"id": one.servo_id} | {name: getattr(one, name) for name in names} for one in result.found]
     document = {"port": args.port, "servos": rows, "garbled_bauds": list(result.garbled)}
     return Answer(document, [*tables_of({f"Servos on {args.port}": rows}), *garbled])
 
@@ -150,17 +140,9 @@ def _set_id(args: argparse.Namespace) -> Answer:
         return Answer({"id": args.new_id, "old_id": args.id, "baud": link.baud})
 
 
-def _unit_baud(text: str) -> int:
-    """Read a baud rate of units (argparse ``type``)."""
-    bauds = sorted(_unit_bench().bauds)
-    if not text.isascii() or not text.isdigit() or int(text) not in bauds:
-        raise argparse.ArgumentTypeError(f"'{text}' where one of {', '.join(map(str, bauds))} is expected")
-    return int(text)
-
-
 UNIT = (
     option("PORT", "serial device or socket://HOST:4000"),
-    option("--baud B", "bits a second (default: as units come from the factory)", type=_unit_baud),
+    option("--baud B", "bits a second (default: as units come from the factory)", type=WHOLE),
 )
 
 
@@ -199,10 +181,9 @@ def _unit(found: Any) -> Answer:
 
 PTY = option("--pty", "a serial line as a pseudo terminal")
 SERVED = (
+    option("--baud B", "of all; as they come from the factory when left out", type=WHOLE),
     option("--link PATH", "with --pty: a stable name for the terminal"),
     option("--faults FILE", "a fault script, which begins at once"),
-    option("--no-wire-time", "bytes take no time, and any baud rate is right"),
-    option("--verbose", "log every piece that passes on standard error"),
 )
 
 
@@ -214,7 +195,6 @@ SERVED = (
         "(default: xm430_w350:1 and xm430_w350:2)",
         repeat=True,
     ),
-    option("--baud B", "of all servos", type=int, default=57600),
     one_of(PTY, required=True),
     *SERVED,
     help="a bus of Dynamixel servos (protocol 2.0)",
@@ -225,52 +205,48 @@ def _dynamixel(args: argparse.Namespace) -> int:
     from drivers.sim.wire.dynamixel_models import BAUD_RATES
     from drivers.sim.wire.dynamixel_servo import SimulatedServo
 
-    wanted = [_servo(text) for text in args.servo or ("xm430_w350:1", "xm430_w350:2")]
-    registers = {"baud_rate": _rate(args.baud, BAUD_RATES)}
-    panel, clock = _panel()
-    servos = []
-    for place, (model, servo_id) in enumerate(wanted):
-        axis = _axis("ph42" if model.startswith("ph") else "dynamixel_x", place, panel, clock)
-        with _wrong_use(f"--servo {model}:{servo_id}: "):
-            servos.append(SimulatedServo(model, servo_id, axis, settings=registers, time_s=clock.now_s()))
-    facts = {"servos": [{"model": model, "id": servo_id} for model, servo_id in wanted], "baud": args.baud}
-    return _serve(args, DynamixelBus(servos), panel, clock, facts)
+    line, servos, facts = _SimulatedLine(args), [], []
+    registers = {"baud_rate": _rate(args.baud or 57600, BAUD_RATES)}
+    for place, text in enumerate(args.servo or ("xm430_w350:1", "xm430_w350:2")):
+        found = WIRE_ID.fullmatch(text)
+        if found is None or int(found[2]) > 252:
+            raise WrongUse(f"--servo is '{text}', expected MODEL:ID with an id from 0 to 252")
+        model, servo_id = found[1].lower().replace("-", "_"), int(found[2])
+        axis = line.axis("ph42" if model.startswith("ph") else "dynamixel_x", place)
+        with _wrong_use(f"--servo {text}: "):
+            servos.append(SimulatedServo(model, servo_id, axis, settings=registers, time_s=line.now_s))
+        facts.append({"model": model, "id": servo_id})
+    return line.serve(DynamixelBus(servos), {"servos": facts, "baud": args.baud or 57600})
 
 
 @command(
     "rig sim feetech",
     option("--model MODEL", "of both", default="sts3215"),
-    option("--baud B", "of both", type=int, default=1_000_000),
-    option("--echo", "the adapter gives back what is sent"),
     one_of(PTY, required=True),
     *SERVED,
     help="a bus of two Feetech servos, ids 1 and 2",
     example="--pty",
 )
 def _feetech(args: argparse.Namespace) -> int:
-
     from drivers.sim.wire.feetech_bus import FeetechBus
     from drivers.sim.wire.feetech_servo import BAUDS, SimulatedFeetechServo
 
-    registers = {"baud": _rate(args.baud, BAUDS)}
-    panel, clock = _panel()
+    line, baud = _SimulatedLine(args), args.baud or 1_000_000
+    registers = {"baud": _rate(baud, BAUDS)}
     with _wrong_use("--model: "):
         servos = [
             SimulatedFeetechServo(
-                args.model, place + 1, _axis("dynamixel_x", place, panel, clock), settings=registers,
-                time_s=clock.now_s(),
+                args.model, place + 1, line.axis("dynamixel_x", place), settings=registers, time_s=line.now_s
             )
             for place in (0, 1)
-        ]  # fmt: skip
-    facts = {"servos": [{"model": args.model, "id": place} for place in (1, 2)], "baud": args.baud}
-    return _serve(args, FeetechBus(servos, echoes=args.echo), panel, clock, facts)
+        ]
+    facts = {"servos": [{"model": args.model, "id": place} for place in (1, 2)], "baud": baud}
+    return line.serve(FeetechBus(servos), facts)
 
 
 @command(
     "rig sim ptu",
     option("--model MODEL", "the unit", default="d46_70"),
-    option("--step-mode MODE", "F, H, Q, E or A; as delivered when left out"),
-    option("--baud B", "of the serial line", type=int, default=9600),
     one_of(PTY, option("--tcp [HOST:]PORT", "a TCP port; 0 is any free one"), required=True),
     *SERVED,
     help="a FLIR / Directed Perception pan/tilt unit",
@@ -279,12 +255,10 @@ def _feetech(args: argparse.Namespace) -> int:
 def _ptu(args: argparse.Namespace) -> int:
     from drivers.sim.wire.ptu import SimulatedPtu
 
-    panel, clock = _panel()
-    pan, tilt = (_axis("ptu_d46_70", place, panel, clock) for place in (0, 1))
+    line, baud = _SimulatedLine(args), args.baud or 9600
     with _wrong_use(""):
-        unit = SimulatedPtu(args.model, pan, tilt, step_mode=args.step_mode, baud=args.baud)
-    facts = {"model": args.model, "step_mode": unit.pan.mode, "baud": args.baud}
-    return _serve(args, unit, panel, clock, facts, unit.banner)
+        unit = SimulatedPtu(args.model, *(line.axis("ptu_d46_70", place) for place in (0, 1)), baud=baud)
+    return line.serve(unit, {"model": args.model, "step_mode": unit.pan.mode, "baud": baud}, unit.banner)
 
 
 @contextlib.contextmanager
@@ -305,79 +279,50 @@ def _rate(baud: int, rates: Any) -> int:
     return int(rates.index(baud))
 
 
-def _servo(text: str) -> tuple[str, int]:
-    """``MODEL:ID`` of --servo."""
-    model, _, number = text.partition(":")
-    if not (number.isascii() and number.isdigit() and int(number) <= 252):
-        raise WrongUse(f"--servo is '{text}', expected MODEL:ID with an id from 0 to 252")
-    return model.lower().replace("-", "_"), int(number)
+class _SimulatedLine:
+    """What simulated devices on a line have in common: the machine's clock, faults, and the line."""
 
+    def __init__(self, args: argparse.Namespace) -> None:
+        from drivers.clock import SystemClock
+        from drivers.faults import FaultPanel
 
-def _panel() -> tuple[FaultPanel, Clock]:
-    """A panel of faults on the machine's clock."""
-    from drivers.clock import SystemClock
-    from drivers.faults import FaultPanel
+        self._args, self._clock = args, SystemClock()
+        self._panel = FaultPanel(self._clock.now_s, ())
+        self.now_s = self._clock.now_s()
 
-    clock = SystemClock()
-    return FaultPanel(clock.now_s, ()), clock
+    def axis(self, preset: str, place: int) -> WireAxis:
+        """Return an axis with backlash and sag of pan (even places) or tilt."""
+        from drivers.sim.axis import WireAxis
+        from drivers.sim.heads import PRESETS
 
+        number: Literal[0, 1] = 1 if place % 2 else 0
+        settings = PRESETS[preset].tilt if number else PRESETS[preset].pan
+        return WireAxis(settings, self._panel, number=number, time_s=self.now_s)
 
-def _axis(preset: str, place: int, panel: FaultPanel, clock: Clock) -> WireAxis:
-    """An axis with backlash and sag of pan (even places) or tilt."""
-    from drivers.sim.axis import WireAxis
-    from drivers.sim.heads import PRESETS
+    def serve(self, device: WireDevice, facts: Mapping[str, Any], banner: bytes = b"") -> int:
+        """Open the line, print its address, and keep it up until SIGTERM or SIGINT."""
+        from drivers.faults import read_script
+        from drivers.sim.wire.line import PtyLine, TcpLine
 
-    number: Literal[0, 1] = 1 if place % 2 else 0
-    settings = PRESETS[preset].tilt if number else PRESETS[preset].pan
-    return WireAxis(settings, panel, number=number, time_s=clock.now_s())
-
-
-def _serve(
-    args: argparse.Namespace,
-    device: WireDevice,
-    panel: FaultPanel,
-    clock: Clock,
-    facts: Mapping[str, Any],
-    banner: bytes = b"",
-) -> int:
-    """Open the line, print its address, and keep it up until SIGTERM or SIGINT."""
-    from drivers.faults import read_script
-    from drivers.sim.wire.line import PtyLine, TcpLine
-
-    tcp = getattr(args, "tcp", None)
-    if tcp is not None and args.link is not None:
-        raise WrongUse("--link goes with --pty")
-    signals.write_from_background()
-    observer = _observer(clock.now_s()) if args.verbose else None
-    if args.faults is not None:
-        panel.set_all(read_script(args.faults), origin=str(args.faults))
-    line: PtyLine | TcpLine
-    if tcp is None:
-        line = PtyLine(
-            device, clock, panel, link=args.link, wire_time=not args.no_wire_time, observer=observer
-        )
-        port = line.path
-    else:
-        host, _, number = tcp.rpartition(":")
-        if not (number.isascii() and number.isdigit() and int(number) <= 65535):
-            raise WrongUse(f"--tcp is '{tcp}', expected [HOST:]PORT with a port from 0 to 65535")
-        host = host.strip("[]") or "127.0.0.1"
-        line = TcpLine(device, clock, panel, host, int(number), banner=banner, observer=observer)
-        port = f"socket://{f'[{host}]' if ':' in host else host}:{line.port}"
-    with line, contextlib.suppress(KeyboardInterrupt):
-        output.show(args, Answer({"port": port, **facts}, port))
-        while True:
-            signal.pause()
-    return 0
-
-
-def _observer(start_s: float) -> Callable[[Literal["host", "device"], bytes, float], None]:
-    """A log of what passes: seconds, the sender, the bytes as text or in hex."""
-
-    def observe(sender: Literal["host", "device"], data: bytes, time_s: float) -> None:
-        plain = all(32 <= byte < 127 or byte in b"\r\n" for byte in data)
-        shown = repr(data)[1:] if plain else data.hex(" ")
-        with contextlib.suppress(OSError):
-            sys.stderr.write(f"{time_s - start_s:10.4f} {'->' if sender == 'host' else '<-'} {shown}\n")
-
-    return observe
+        args, tcp = self._args, getattr(self._args, "tcp", None)
+        if tcp is not None and args.link is not None:
+            raise WrongUse("--link goes with --pty")
+        signals.write_from_background()
+        if args.faults is not None:
+            self._panel.set_all(read_script(args.faults), origin=str(args.faults))
+        line: PtyLine | TcpLine
+        if tcp is None:
+            line = PtyLine(device, self._clock, self._panel, link=args.link)
+            port = line.path
+        else:
+            host, _, number = tcp.rpartition(":")
+            if not (number.isascii() and number.isdigit() and int(number) <= 65535):
+                raise WrongUse(f"--tcp is '{tcp}', expected [HOST:]PORT with a port from 0 to 65535")
+            host = host.strip("[]") or "127.0.0.1"
+            line = TcpLine(device, self._clock, self._panel, host, int(number), banner=banner)
+            port = f"socket://{f'[{host}]' if ':' in host else host}:{line.port}"
+        with line, contextlib.suppress(KeyboardInterrupt):
+            output.show(args, Answer({"port": port, **facts}, port))
+            while True:
+                signal.pause()
+        return 0

@@ -7,7 +7,7 @@ the same to the last bit whatever was done before it, on this machine or another
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
@@ -22,9 +22,6 @@ from mastctl.config import Config, Listen, load_config, not_simulated
 from mastctl.devices.frames import camera_and_sequence
 from mastctl.experiment.pointing import (
     ClickTruth,
-    PointingExperiment,
-    head_pair,
-    run_pointing_experiment,
 )
 
 if TYPE_CHECKING:
@@ -105,16 +102,6 @@ class Rover:
     mast_file: bytes | None = None
 
 
-@dataclass(frozen=True)
-class PointingTask:
-    """One target of the pointing experiment."""
-
-    rover: Rover
-    distance_m: float
-    index: int
-    pictures: bool = False
-
-
 @contextmanager
 def running_rover(rover: Rover) -> Iterator[tuple[RunningDaemon, Client, RoverModel]]:
     """Start the rover behind a daemon of its own, with a client of it, and end both."""
@@ -129,26 +116,3 @@ def running_rover(rover: Rover) -> Iterator[tuple[RunningDaemon, Client, RoverMo
         with RunningDaemon(config) as daemon, Client(daemon.url) as client:
             assert daemon.hardware.simulation is not None  # the packaged configuration is a simulated rover
             yield daemon, client, daemon.hardware.simulation
-
-
-def one_pointing(task: PointingTask) -> PointingExperiment:
-    """Point at one target, on a rover of its own."""
-    with running_rover(task.rover) as (daemon, client, rover):
-        rig = daemon.service.stored.rig
-        camera = head_pair(rig, set(client.status()["cameras"]))[0]
-        return run_pointing_experiment(
-            client,
-            targets=1,
-            distances_m=(task.distance_m,),
-            seed=task.rover.seed,
-            truth=simulation_truth(rover),
-            notes=(head_note(rover, rig, camera),),
-            pictures=int(task.pictures),
-            first=task.index,
-        )
-
-
-def joined_pointings(parts: Sequence[PointingExperiment]) -> PointingExperiment:
-    """Return one experiment of many with a target each; its time is that of all targets one after another."""
-    records = tuple(record for part in parts for record in part.records)
-    return replace(parts[0], records=records, seconds=sum(part.seconds for part in parts))

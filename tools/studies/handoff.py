@@ -21,7 +21,7 @@ from calib.files.mast_file import load_rig
 from calib.matching.handoff import handoff_bias
 from mastctl.cli import output
 from mastctl.cli.daemon import DAEMON, client_of
-from mastctl.cli.experiment import check_place, results_of, run_bar
+from mastctl.cli.experiment import results_of, run_bar
 from mastctl.cli.options import add_options, at_least
 from mastctl.cli.output import check_folder
 from mastctl.client import Client
@@ -136,7 +136,6 @@ def main(words: Sequence[str] | None = None) -> int:
     if args.mast_file is not None and not args.simulated:
         raise output.WrongUse("--mast-file belongs to --simulated; a running daemon has its own mast file")
     check_folder(args.out, "--out")
-    check_place(args)
     if args.simulated:
         return _report(args, _simulated(args))
     with client_of(args) as client:

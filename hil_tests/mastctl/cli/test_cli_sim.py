@@ -60,12 +60,12 @@ def ask(port: str, text: bytes, timeout_s: float = NET_S) -> bytes:
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_ptu_on_a_terminal_answers_until_a_signal(repository: Path, tmp_path: Path, number: int) -> None:
     link = tmp_path / "ptu"
-    with sim(repository, "ptu", "--pty", "--link", str(link), "--verbose") as running:
+    with sim(repository, "ptu", "--pty", "--link", str(link)) as running:
         assert running.first == str(link)
         assert ask(running.first, b"PR ") == b"PR * 46.2857 seconds arc per Pan position\r\n"
         code, out, log = running.end(number)
     assert (code, out) == (0, "") and not link.is_symlink()
-    assert "-> 'PR '" in log and "<- 'PR * 46.2857" in log and "Traceback" not in log
+    assert "Traceback" not in log
 
 
 def test_servos_of_two_models_answer_the_plain_sdk(repository: Path) -> None:

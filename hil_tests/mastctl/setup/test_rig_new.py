@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 from collections.abc import Iterator
@@ -274,16 +273,3 @@ def test_a_pair_of_cameras_is_drawn_with_options_of_its_driver(tmp_path: Path) -
     for name, camera in config.hardware.cameras.items():
         assert parse_options(camera.options, name).size_px == (640, 480)
     assert dynamixel_settings(config.hardware.pan_tilt.options).port == "/dev/serial/by-id/usb-FTDI"
-
-
-def test_a_person_at_a_terminal_is_asked_until_the_answer_is_a_number(
-    tmp_path: Path, nothing: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("mastctl.signals.can_ask", lambda: True)
-    monkeypatch.setattr("sys.stdin", io.StringIO("tall\n1.4\n\n\n-60 60 3\n-60 60\n\n"))
-    assert main(["rig", "new", str(tmp_path / "rig")]) == 0
-    asked = capsys.readouterr().err
-    assert asked.count("height of the axes") == 2 and "'tall' where a finite number is expected" in asked
-    assert load_rig(tmp_path / "rig" / MAST).rig.mast.translation_m[2] == pytest.approx(-1.4, abs=0.01)
-    low, high = load_config(tmp_path / "rig" / CONFIG).limits.pan_rad
-    assert low == pytest.approx(-high) and high < math.radians(60)
