@@ -16,11 +16,12 @@ import httpx
 import pytest
 import yaml
 from google.protobuf.descriptor import Descriptor
+from google.protobuf.descriptor_pool import Default
+from google.protobuf.message_factory import GetMessageClass
 from mcap.reader import make_reader
 
 from hil_tests.waiting import until
 from mastctl.client import Client
-from mastctl.recorder.schemas import PROTOBUF
 
 pytestmark = pytest.mark.mastctl(speed=1)
 
@@ -185,9 +186,10 @@ def test_a_recording_has_every_topic_and_field_of_the_layout(layout: dict[str, A
     with recording.open("rb") as stream:
         for schema, channel, message in make_reader(stream).iter_messages():
             assert schema is not None
-            if schema.name in PROTOBUF:
-                schemas[channel.topic] = PROTOBUF[schema.name].DESCRIPTOR
-                messages.setdefault(channel.topic, []).append(PROTOBUF[schema.name].FromString(message.data))
+            if schema.encoding == "protobuf":
+                kind = Default().FindMessageTypeByName(schema.name)
+                schemas[channel.topic] = kind
+                messages.setdefault(channel.topic, []).append(GetMessageClass(kind).FromString(message.data))
             else:
                 messages.setdefault(channel.topic, []).append(json.loads(message.data))
     wanted = sorted(set(paths(layout["configById"])))

@@ -29,7 +29,7 @@ from calib.files.pictures import decode_picture
 from calib.files.tables import check_header, csv_rows
 from drivers.errors import BadFrame, BadOptions
 from drivers.interfaces import Image
-from drivers.recordings.mcap_file import BadRecording, McapEntry, read_at, read_items
+from drivers.recordings.mcap_file import BadRecording, Item, McapContents, McapEntry, read_at, read_items
 from drivers.recordings.pds3 import looks_like_pds3, read_product
 
 SAME_RAD = 1e-7
@@ -277,19 +277,25 @@ def recording_files(path: Path) -> list[Path]:
 def read_frames(path: Path) -> Iterator[McapFrame]:
     """Yield the frames of a recording in their order; their pictures are not kept. Raises BadRecording."""
     for file in recording_files(path):
-        facts: dict[tuple[str, int], dict[str, Any]] = {}
-        for item in read_items(file):
-            if not isinstance(item, McapEntry) or not item.channel.topic.startswith("/camera/"):
-                continue
+        yield from (item for item in items_with_frames(file) if isinstance(item, McapFrame))
+
+
+def items_with_frames(file: Path, found: McapContents | None = None) -> Iterator[Item | McapFrame]:
+    """Yield what a file holds as `read_items` does, with a frame in place of each image that has facts."""
+    facts: dict[tuple[str, int], dict[str, Any]] = {}
+    for item in read_items(file, found):
+        if isinstance(item, McapEntry) and item.channel.topic.startswith("/camera/"):
             camera, _, what = item.channel.topic.removeprefix("/camera/").rpartition("/")
             place = camera, item.message.log_time
             if what == "frame":
-                found = _facts(item.message.data)
-                if found is not None and found["camera"] == camera:
-                    facts[place] = found
+                one = _facts(item.message.data)
+                if one is not None and one["camera"] == camera:
+                    facts[place] = one
             elif what == "image" and place in facts:
-                there = replace(item, message=replace(item.message, data=b""))
-                yield McapFrame(facts.pop(place), file, there)
+                without = replace(item, message=replace(item.message, data=b""))
+                yield McapFrame(facts.pop(place), file, without)
+                continue
+        yield item
 
 
 def read_recording(path: Path) -> list[RecordedPointing]:

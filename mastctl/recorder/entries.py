@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -16,17 +16,17 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
+from typing_extensions import TypedDict
 
 from calib.files.mast_file import model_keys
 from calib.files.twin import TwinError, nearest_opencv, twin_error
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig, RigCamera
 from calib.geometry.rigid import Rigid, quaternion_of
-from mastctl.answers import HeadAnswer
+from mastctl.answers import Count, Event, FaultAnswer, HeadAnswer, Json, Pointing
 from mastctl.as_json import as_json
 from mastctl.devices.frames import StampedFrame
 from mastctl.frame_facts import FrameFacts
-from mastctl.recorder.schemas import RecordedCamera
 from mastctl.recorder.writer import Attached, RecordFile
 
 SAME_RAD = 1e-6
@@ -34,6 +34,51 @@ REST_S = 10.0
 """A head at rest is recorded this often, so that an idle daemon writes next to nothing."""
 
 FACTS = tuple(one.name for one in fields(FrameFacts))
+
+
+class RecordedCamera(TypedDict):
+    """A camera in its frame as a mast file has it, and how far the nearest plumb_bob camera is, pixels."""
+
+    camera: str
+    on: str
+    mast_digest: str
+    model: Json
+    plumb_bob: Json
+
+
+class RecordedTarget(TypedDict):
+    """A target in the rover frame."""
+
+    operation: str
+    position_m: list[float]
+    range_m: float | None
+
+
+class ResidualRecord(Pointing):
+    """A pointing that measured a residual."""
+
+    operation: str
+    pointing: Count
+
+
+class FaultRecord(TypedDict):
+    """All that is wrong with one device."""
+
+    device: str
+    faults: list[FaultAnswer]
+
+
+class DroppedRecord(TypedDict):
+    """How many values were not written so far, by topic."""
+
+    dropped: dict[str, Count]
+    reason: str
+
+
+RECORDS: Mapping[str, Any] = {
+    get_args(hints["topic"])[0]: hints["value"] for hints in map(get_type_hints, get_args(Event))
+} | {"fault": FaultRecord}
+"""The type of each topic's record."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +135,7 @@ class Entries:
         time_ns = file.clocks.ns(time_s)
         for name, camera in self.mast.rig.cameras.items():
             message, record = calibration(name, camera, self.mast.file.digest, time_ns)
-            file.add_json(f"/camera/{name}/cahvor", "cahvor", record, time_s)
+            file.add_json(f"/camera/{name}/cahvor", record, time_s, RecordedCamera)
             if message is not None:
                 file.add_message(f"/camera/{name}/calibration", message, time_s)
 
@@ -108,7 +153,7 @@ class Entries:
         before = self._joints
         self.remember(one)
         if one.topic == "joints":
-            if before is None or not self._rests(before, one.value):
+            if before is None or self._moved(before, one.value):
                 self._write_joints(file, one.value)
         elif one.topic == "frame":
             self._write_frame(file, one.value)
@@ -124,18 +169,17 @@ class Entries:
         if count > self._written_dropped:
             self._written_dropped = count
             record = {"dropped": dict(dropped), "reason": "the disk was slower than the data"}
-            file.add_json("/recorder", "recorder", record, time_s)
+            file.add_json("/recorder", record, time_s, DroppedRecord)
 
-    def _rests(self, before: HeadAnswer, now: HeadAnswer) -> bool:
-        """Whether the head has not moved since a reading that needs no repetition yet."""
-        still = not (now["moving"] or before["moving"])
-        still = still and abs(before["pan_rad"] - now["pan_rad"]) < SAME_RAD
-        still = still and abs(before["tilt_rad"] - now["tilt_rad"]) < SAME_RAD
-        return still and now["measured_s"] - self._joints_written_s < REST_S
+    def _moved(self, before: HeadAnswer, now: HeadAnswer) -> bool:
+        """Whether the head has moved since a reading, or that one is old enough to be repeated."""
+        by_rad = abs(before["pan_rad"] - now["pan_rad"]), abs(before["tilt_rad"] - now["tilt_rad"])
+        still = not (now["moving"] or before["moving"]) and max(by_rad) < SAME_RAD
+        return not still or now["measured_s"] - self._joints_written_s >= REST_S
 
     def _write_joints(self, file: RecordFile, reading: HeadAnswer) -> None:
         time_s = self._joints_written_s = reading["measured_s"]
-        file.add_json("/joints", "joints", reading, time_s)
+        file.add_json("/joints", reading, time_s, HeadAnswer)
         true_rad = reading["true_pan_rad"], reading["true_tilt_rad"]
         tree = transforms(self.mast.rig, *true_rad, file.clocks.ns(time_s))
         file.add_message("/tf", tree, time_s)
@@ -146,23 +190,23 @@ class Entries:
         self._frames[frame.camera] = frame.frame_id
         time_s = frame.mid_exposure_s
         facts = {name: as_json(getattr(frame, name)) for name in FACTS} | {"colour": frame.image.ndim == 3}
-        file.add_json(f"/camera/{frame.camera}/frame", "frame", facts, time_s)
+        file.add_json(f"/camera/{frame.camera}/frame", facts, time_s, FrameFacts)
         image = picture(frame, file.clocks.ns(time_s))
         file.add_message(f"/camera/{frame.camera}/image", image, time_s)
 
     def _write_json(self, file: RecordFile, one: Entry) -> None:
         record = {"device": one.key, "faults": one.value} if one.topic == "fault" else one.value
-        file.add_json(f"/{one.topic}", one.topic, record, one.time_s)
+        file.add_json(f"/{one.topic}", record, one.time_s, RECORDS.get(one.topic))
 
     def _write_outcome(self, file: RecordFile, one: Entry) -> None:
         """Write the result of an operation that ended: its target and its residuals."""
         for number, pointing in enumerate(one.value["pointings"], start=1):
             if pointing["residual_px"] is not None:
                 record = {"operation": one.key, "pointing": number, **pointing}
-                file.add_json("/residual", "residual", record, one.time_s)
+                file.add_json("/residual", record, one.time_s, ResidualRecord)
         if position_m := one.value["position_m"]:
             target = {"operation": one.key, "position_m": position_m, "range_m": one.value["range_m"]}
-            file.add_json("/target", "target", target, one.time_s)
+            file.add_json("/target", target, one.time_s, RecordedTarget)
             scene = target_scene(position_m, file.clocks.ns(one.time_s))
             file.add_message("/target/scene", scene, one.time_s)
 
@@ -199,33 +243,30 @@ def calibration(
     name: str, camera: RigCamera, digest: str, time_ns: int
 ) -> tuple[Message | None, RecordedCamera]:
     """Return the nearest ``plumb_bob`` camera (None if there is none) and the camera itself, as JSON."""
-    model = camera.model
-
-    def record(near: dict[str, Any]) -> RecordedCamera:
-        return {
-            "camera": name, "model": as_json(model_keys(model)), "plumb_bob": near, "on": camera.on,
-            "mast_digest": digest,
-        }  # fmt: skip
-
-    if np.linalg.det([model.H, model.V, model.A]) < 0.0:
-        return None, record({"none": "the image is mirrored, and no plumb_bob camera is"})
+    model, message = camera.model, None
     try:
+        if np.linalg.det([model.H, model.V, model.A]) < 0.0:
+            raise ValueError("the image is mirrored, and no plumb_bob camera is")
         near, error_px = _nearest(model)
+        distance: Json = as_json({"rms_px": error_px.rms_px, "worst_px": error_px.worst_px})
+        width, height = model.size_px
+        message = CameraCalibration(
+            timestamp=_stamp(time_ns),
+            frame_id=name,
+            width=width,
+            height=height,
+            distortion_model="plumb_bob",
+            D=near.distortion.tolist(),
+            K=near.camera_matrix.ravel().tolist(),
+            R=np.eye(3).ravel().tolist(),
+            P=np.hstack([near.camera_matrix, np.zeros((3, 1))]).ravel().tolist(),
+        )
     except ValueError as error:
-        return None, record({"none": str(error)})
-    width, height = model.size_px
-    message = CameraCalibration(
-        timestamp=_stamp(time_ns),
-        frame_id=name,
-        width=width,
-        height=height,
-        distortion_model="plumb_bob",
-        D=near.distortion.tolist(),
-        K=near.camera_matrix.ravel().tolist(),
-        R=np.eye(3).ravel().tolist(),
-        P=np.hstack([near.camera_matrix, np.zeros((3, 1))]).ravel().tolist(),
-    )
-    return message, record(as_json({"rms_px": error_px.rms_px, "worst_px": error_px.worst_px}))
+        distance = {"none": str(error)}
+    return message, {
+        "camera": name, "model": as_json(model_keys(model)), "plumb_bob": distance, "on": camera.on,
+        "mast_digest": digest,
+    }  # fmt: skip
 
 
 @lru_cache(maxsize=64)

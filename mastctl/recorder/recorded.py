@@ -5,8 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from mcap.writer import CompressionType, Writer
 from calib.errors import BadFile
 from calib.files.mast_file import StoredRig, parse_rig
 from calib.files.yaml_text import dump_mapping, parse_mapping
-from drivers.recordings.frames import McapFrame, read_frames, recording_files
+from drivers.recordings.frames import McapFrame, items_with_frames, recording_files
 from drivers.recordings.mcap_file import BadRecording, McapContents, McapEntry, read_items
 from mastctl.packaged import driver_of_hardware
 from mastctl.recorder.writer import CHUNK_BYTES, Attached
@@ -78,17 +78,14 @@ def _copied(sources: Sequence[Path], writer: Writer) -> list[McapContents]:
                 writer.add_attachment(*times, item.name, item.media_type, item.data)
             elif isinstance(item, McapEntry):
                 one, channel, schema = item.message, item.channel, item.schema
-                place = channel.topic, channel.message_encoding, "" if schema is None else schema.name
+                name, data = ("", b"") if schema is None else (schema.name, schema.data)
+                place = channel.topic, channel.message_encoding, name
                 if place not in channels:
-                    number = 0
-                    if schema is not None and (schema.name, schema.data) not in schemas:
-                        number = writer.register_schema(schema.name, schema.encoding, schema.data)
-                        schemas[schema.name, schema.data] = number
-                    elif schema is not None:
-                        number = schemas[schema.name, schema.data]
-                    channels[place] = writer.register_channel(
-                        channel.topic, channel.message_encoding, number, dict(channel.metadata)
-                    )
+                    if schema is not None and (name, data) not in schemas:
+                        schemas[name, data] = writer.register_schema(name, schema.encoding, data)
+                    number = schemas.get((name, data), 0)
+                    facts = dict(channel.metadata)
+                    channels[place] = writer.register_channel(*place[:2], number, facts)
                 writer.add_message(channels[place], one.log_time, one.data, one.publish_time, one.sequence)
     if not started:
         writer.start()
@@ -103,7 +100,7 @@ CONFIG_SCHEMA = "mastctl/config/1"
 SPEED_RAD_PER_S, WHOLE_TURN_RAD = 1.0, 6.2832  # of a replay without the limits of a configuration
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Recording:
     """A recording, read.
 
@@ -114,13 +111,13 @@ class Recording:
 
     path: Path
     files: tuple[Path, ...]
-    found: tuple[McapContents, ...]
-    facts: Mapping[str, str]
-    masts: Mapping[str, tuple[Attached, StoredRig]]
-    config: Attached | None
-    operations: Mapping[str, Mapping[str, Any]]
-    handoffs: tuple[Mapping[str, Any], ...]
-    frames: Mapping[str, McapFrame]
+    found: list[McapContents] = field(default_factory=list)
+    facts: dict[str, str] = field(default_factory=dict)
+    masts: dict[str, tuple[Attached, StoredRig]] = field(default_factory=dict)
+    config: Attached | None = None
+    operations: dict[str, dict[str, Any]] = field(default_factory=dict)
+    handoffs: list[dict[str, Any]] = field(default_factory=list)
+    frames: dict[str, McapFrame] = field(default_factory=dict)
 
     @property
     def first_mast(self) -> tuple[Attached, StoredRig]:
@@ -146,43 +143,38 @@ class Recording:
 
 
 def read_whole(path: Path) -> Recording:
-    """Read a recording: a file, or a folder of the ring's segments. Raises BadRecording."""
+    """Read a recording, once: a file, or a folder of the ring's segments. Raises BadRecording."""
     files = tuple(recording_files(path))
-    found, facts, masts = [], dict[str, str](), dict[str, tuple[Attached, StoredRig]]()
-    configs: list[Attached] = []
-    operations, handoffs = dict[str, Mapping[str, Any]](), list[Mapping[str, Any]]()
+    one = Recording(path, files)
     for file in files:
-        found.append(McapContents())
-        for item in read_items(file, found[-1]):
-            if isinstance(item, Metadata):
-                facts |= item.metadata
+        one.found.append(McapContents())
+        for item in items_with_frames(file, one.found[-1]):
+            if isinstance(item, McapFrame):
+                one.frames[str(item.facts["frame_id"])] = item
+            elif isinstance(item, Metadata):
+                one.facts.update(item.metadata)
             elif isinstance(item, Attachment):
-                one = Attached(item.name, bytes(item.data), item.media_type)
-                expected = facts.get(f"sha256 {one.name}", one.digest)
-                if one.digest != expected and one.digest not in masts:
-                    log.warning("%s: %s is not what it was when the recording began", file, one.name)
-                _attach(file, one, masts, configs)
+                _attach(one, file, Attached(item.name, bytes(item.data), item.media_type))
             elif isinstance(item, McapEntry) and item.channel.topic in ("/operation", "/handoff"):
                 record = _record(item.message.data)
                 if item.channel.topic == "/handoff" and record:
-                    handoffs.append(record)
+                    one.handoffs.append(record)
                 elif isinstance(record.get("id"), str):
-                    operations[record["id"]] = record
-    frames = {str(frame.facts["frame_id"]): frame for frame in read_frames(path)}
-    config = configs[0] if configs else None
-    return Recording(path, files, tuple(found), facts, masts, config, operations, tuple(handoffs), frames)
+                    one.operations[record["id"]] = record
+    return one
 
 
-def _attach(
-    file: Path, one: Attached, masts: dict[str, tuple[Attached, StoredRig]], configs: list[Attached]
-) -> None:
+def _attach(recording: Recording, file: Path, one: Attached) -> None:
     """Keep an attached file by its schema; one that cannot be read is logged."""
+    expected = recording.facts.get(f"sha256 {one.name}", one.digest)
+    if one.digest != expected and one.digest not in recording.masts:
+        log.warning("%s: %s is not what it was when the recording began", file, one.name)
     try:
         schema = parse_mapping(one.data, one.name).get("schema")
         if schema == MAST_SCHEMA:
-            masts.setdefault(one.digest, (one, parse_rig(one.data, one.name)))
-        elif schema == CONFIG_SCHEMA:
-            configs.append(one)
+            recording.masts.setdefault(one.digest, (one, parse_rig(one.data, one.name)))
+        elif schema == CONFIG_SCHEMA and recording.config is None:
+            recording.config = one
     except BadFile as error:
         log.warning("%s: an attached file cannot be used: %s", file, error)
 

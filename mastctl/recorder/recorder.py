@@ -92,8 +92,7 @@ class Recorder:
         self._begun_s = self._retry_s = 0.0
         self._judged_bytes = -1
         self._keep: tuple[float, str] | None = None  # when the ring is kept, and why
-        self._kept_before: dict[tuple[str, str], float] = {}
-        self._standing: set[tuple[str, str]] = set()
+        self._fault_seen_s: dict[tuple[str, str], float] = {}
         self._news = publisher.subscribe(*(TOPICS - NOT_RECORDED))
         self._thread = threading.Thread(target=self._work, name=NAME, daemon=True)
         self._thread.start()
@@ -113,7 +112,7 @@ class Recorder:
             "ring_s": self._ring_s,
             "run": self._run,
             "file": None if file is None else file.path.name,
-            "size_mb": 0.0 if file is None else file.size_mb,
+            "size_mb": 0.0 if file is None else file.size / MB,
             "dropped": self._dropped_so_far(),
             "fault": None if fault is None else fault.message,
             "folder": str(self._folder.path),
@@ -215,7 +214,7 @@ class Recorder:
             news = self._news.wait(WAIT_S if self._requests.empty() else 0.0)
             since_s, taken_s = taken_s, time.monotonic()  # these values were published between the two
             self._busy_since_s = time.monotonic(), self._clock.now_s()
-            self._guarded(lambda: self._write(self._entries_of(news), since_s))  # noqa: B023
+            self._guarded(lambda: self._write(news, since_s))  # noqa: B023
             while not self._requests.empty():
                 self._answer(*self._requests.get())
             self._guarded(self._look_after)
@@ -225,18 +224,6 @@ class Recorder:
                 return
             if self._news.closed and not news:
                 time.sleep(WAIT_S)  # the publisher was closed first
-
-    def _entries_of(self, news: Sequence[Published]) -> list[Entry]:
-        """What is recorded of published values; one of an unexpected kind must not end the recording."""
-        entries, time_s = [], self._clock.now_s()
-        for one in news:
-            try:
-                value = one.value if one.topic == "frame" else self._event_value(one.topic, one.value)
-                entries.append(Entry(one.topic, one.key, value, time_s))
-            except Exception:
-                self._dropped[one.topic] += 1
-                log.exception("the message %s %s cannot be recorded", one.topic, one.key)
-        return entries
 
     def _answer(self, act: Callable[[], Any], answer: Future[Any]) -> None:
         try:
@@ -261,12 +248,8 @@ class Recorder:
 
     def _failed(self, error: OSError) -> None:
         """Give the file up, as a killed daemon leaves it, and try another one after a while."""
-        file = self._file
-        with contextlib.suppress(OSError):
-            if file is not None and self._gone(file):
-                return  # that is the reason
         reason = f"{self._folder.path} cannot be written: {error.strerror or error}"
-        self._stop_writing("unwritable", reason, "it can be written again")
+        file = self._stop_writing("unwritable", reason, "it can be written again")
         if file is not None:
             with contextlib.suppress(OSError):
                 file.abandon()
@@ -286,33 +269,43 @@ class Recorder:
             log.error("%s", message)
         return file
 
-    def _write(self, entries: list[Entry], since_s: float) -> None:
+    def _write(self, news: Sequence[Published | Entry], since_s: float) -> None:
         """Write what was published since a moment into the file, if there is one to be written."""
-        for at, one in enumerate(entries):
+        refused: OSError | None = None
+        for one in news:
             try:
-                if one.topic == "mast":
+                entry = one if isinstance(one, Entry) else self._entry_of(one)
+                if entry.topic == "mast":
                     self._use_mast()
-                self._notice_fault(one)
-                file = self._file or self._open_ring()
-                if file is None:
-                    self._entries.remember(one)
+                self._notice_fault(entry)
+                file = None if refused else self._file or self._open_ring()
+                if file is not None:
+                    file.published_s = since_s
+                    if entry.topic == "frame" and not isinstance(entry.value, StampedFrame):
+                        entry = replace(entry, value=self._frame_by_id(entry.value.frame_id))
+                    self._entries.write(file, entry)
                     continue
-                file.published_s = since_s
-                if one.topic == "frame" and not isinstance(one.value, StampedFrame):
-                    one = replace(one, value=self._frame_by_id(one.value.frame_id))
-                self._entries.write(file, one)
+                self._entries.remember(entry)
+                if refused:
+                    self._dropped[one.topic] += 1
+            except OSError as error:
+                refused = error
+                self._entries.remember(entry)
+                self._dropped[one.topic] += 1
             except MastctlError:  # the frame is gone
                 self._dropped[one.topic] += 1
-            except OSError:
-                self._dropped.update(rest.topic for rest in entries[at:])
-                for rest in entries[at:]:
-                    self._entries.remember(rest)
-                raise
             except Exception:  # a value of an unexpected kind must not end the recording
                 self._dropped[one.topic] += 1
                 log.exception("the message %s %s cannot be recorded", one.topic, one.key)
+        if refused:
+            raise refused
         if (dropped := self._dropped_so_far()) and self._file is not None:
             self._entries.write_dropped(self._file, dropped, self._clock.now_s())
+
+    def _entry_of(self, one: Published) -> Entry:
+        """What is recorded of a published value."""
+        value = one.value if one.topic == "frame" else self._event_value(one.topic, one.value)
+        return Entry(one.topic, one.key, value, self._clock.now_s())
 
     def _use_mast(self) -> None:
         """Attach the mast file in use and write its cameras, if it is another one."""
@@ -323,17 +316,15 @@ class Recorder:
             self._entries.write_cameras(file, time_s)
 
     def _notice_fault(self, one: Entry) -> None:
-        """Have the ring kept soon after a fault that is new."""
+        """Have the ring kept soon after a fault that is new, or was not seen for a while."""
         if one.topic != "fault" or one.key == NAME:  # a full disk is not made to keep more
             return
-        now_s = time.monotonic()
-        standing = {(one.key, fault["code"]) for fault in one.value}
-        new = standing - self._standing
-        self._standing = {entry for entry in self._standing if entry[0] != one.key} | standing
-        new = {entry for entry in new if now_s - self._kept_before.get(entry, -SAME_FAULT_S) >= SAME_FAULT_S}
+        now_s, never_s = time.monotonic(), -SAME_FAULT_S
+        faults = [(one.key, fault["code"]) for fault in one.value]
+        new = [one for one in faults if now_s - self._fault_seen_s.get(one, never_s) >= SAME_FAULT_S]
         if new and self._ring_s and self._keep is None:
-            self._keep = now_s + AFTER_FAULT_S, "-".join(sorted(new)[0])
-        self._kept_before |= dict.fromkeys(new, now_s)
+            self._keep = now_s + AFTER_FAULT_S, "-".join(min(new))
+        self._fault_seen_s |= dict.fromkeys(faults, now_s)
 
     def _look_after(self) -> None:
         """Flush, go on to the next file, keep the ring after a fault, stay within the bounds."""
@@ -341,7 +332,7 @@ class Recorder:
         if self._keep is not None and (now_s >= self._keep[0] or self._closing):
             self._keep_ring(self._keep[1])
         file = self._file
-        if file is None or self._gone(file):
+        if file is None:
             return
         file.flush_if_due(now_s)
         if file.size == self._judged_bytes or self._disk_is_low():
@@ -357,19 +348,6 @@ class Recorder:
         ):
             self._end_file(wait=False)
             self._folder.trim_ring(self._ring_s, self._settings.ring_mb)
-
-    def _gone(self, file: RecordFile) -> bool:
-        """End a file that was moved or deleted; return whether it was."""
-        if file.in_place:
-            return False
-        reason = f"{file.path} was deleted or moved while it was recorded"
-        if self._run is None:
-            log.warning("another segment of the ring begins: %s", reason)
-            self._file = None
-        else:
-            self._stop_writing("run_gone", reason)
-        file.finish(wait=False)
-        return True
 
     def _disk_is_low(self, least: float | None = None) -> bool:
         """End the recording before the disk is full, the ring's oldest first; return whether it was ended."""
@@ -452,9 +430,10 @@ class Recorder:
         file, run = self._file, self._run
         if file is None or run is None:
             raise NotNow("not_recording", "no run is recorded; 'record start' begins one")
-        if self._gone(file):
-            raise Unable("run_gone", "" if self._fault is None else self._fault.message)
         self._end_file()
         log.info("run %s has ended", run)
-        size_mb = file.path.stat().st_size / MB
+        try:
+            size_mb = file.path.stat().st_size / MB
+        except FileNotFoundError:
+            raise Unable("run_gone", f"{file.path} was deleted or moved while it was recorded") from None
         return {"run": run, "file": str(file.path), "size_mb": size_mb, "dropped": self._dropped_so_far()}

@@ -3,6 +3,9 @@
 The library's writer makes chunks and index. Here mast file and configuration come first with their digests,
 and every chunk is written as soon as it is old enough, then synced by a worker that alone waits for the disk
 (`drivers.recordings.mcap_file` reads what a kill leaves).
+
+Messages are Foxglove's protobuf messages, and JSON records. The JSON schema of a record is made from its
+type: that of the event, or one of `mastctl.recorder.entries`, of what a recording has alone.
 """
 
 from __future__ import annotations
@@ -15,21 +18,26 @@ from collections import Counter
 from collections.abc import Mapping
 from concurrent import futures
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+from google.protobuf.descriptor import FileDescriptor
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import Message
+from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import CompressionType, Writer
+from pydantic import TypeAdapter
 
 from calib.files import sync_folder
+from calib.files.records import DIALECT
 from mastctl.as_json import writable
-from mastctl.recorder.schemas import encodings
 
 FINISH_S = 3.0
 PROFILE = "mastctl/record/1"
 CHUNK_BYTES = 4 << 20
 FLUSH_S = 0.25
-"""A chunk is written when its first message is this old: a quarter of what may be lost."""
+"""A chunk is written when its first message is this old: half of what may be lost."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +67,7 @@ class Clocks:
 
 
 class RecordFile:
-    """An MCAP file that grows. Not for several threads at once.
+    """An MCAP file that grows. Not for several threads at once; the properties may be read by any.
 
     ``path`` must not exist yet; ``attached``, mast file and configuration, and ``facts``, the metadata
     ``mastctl``, are written first; ``clocks`` stamp the messages. ``published_s``: when the messages that are
@@ -82,8 +90,7 @@ class RecordFile:
         self._disk = futures.ThreadPoolExecutor(1, "recorder sync")
         self._synced: futures.Future[None] = self._disk.submit(sync_folder, path.parent)
         self._sync_since_s = time.monotonic()
-        self._gathered = 0
-        self._size = 0
+        self._written = self._gathered = 0
         self._attached: set[str] = set()
         try:
             self._writer.start(PROFILE, "mastctl")
@@ -98,6 +105,16 @@ class RecordFile:
             path.unlink(missing_ok=True)  # there is nothing in it
             raise
 
+    @property
+    def size(self) -> int:
+        """Bytes written, and those of the chunk that is gathered."""
+        return self._written + self._gathered
+
+    @property
+    def disk_waits_s(self) -> float:
+        """How long the disk has not answered, seconds."""
+        return 0.0 if self._synced.done() else time.monotonic() - self._sync_since_s
+
     def attach(self, one: Attached, time_ns: int) -> None:
         """Put a file into the recording, unless the same is in it."""
         if one.digest in self._attached:
@@ -106,32 +123,15 @@ class RecordFile:
         self._writer.flush()  # type: ignore[no-untyped-call]  # what was gathered comes before it
         self._writer.add_attachment(time_ns, time_ns, one.name, one.media_type, one.data)
 
-    @property
-    def size(self) -> int:
-        """Bytes written, and those of the chunk that is gathered."""
-        return self._size + self._gathered
-
-    @property
-    def size_mb(self) -> float:
-        """What is written, in 10⁶ bytes; read from any thread."""
-        return self._size / 1e6
-
-    @property
-    def in_place(self) -> bool:
-        """Whether its path still names it: it was not deleted or moved. Reads the disk."""
-        try:
-            return os.path.samestat(self.path.stat(), os.fstat(self._file.fileno()))
-        except (FileNotFoundError, NotADirectoryError):
-            return False
-
-    def add_json(self, topic: str, kind: str, record: Mapping[str, Any], time_s: float) -> None:
-        """Add one JSON message; ``kind`` names its schema."""
-        text = json.dumps(writable(record), separators=(",", ":"))
-        self._add(topic, f"mastctl.{kind}", text.encode(), time_s)
+    def add_json(self, topic: str, record: Mapping[str, Any], time_s: float, kind: Any = None) -> None:
+        """Add one JSON message; ``kind`` is the type of its record, any object without one."""
+        data = json.dumps(writable(record), separators=(",", ":")).encode()
+        self._add(topic, f"mastctl.{topic.rpartition('/')[2]}", kind, data, time_s)
 
     def add_message(self, topic: str, message: Message, time_s: float) -> None:
         """Add one of Foxglove's messages."""
-        self._add(topic, message.DESCRIPTOR.full_name, message.SerializeToString(), time_s)
+        kind = type(message)
+        self._add(topic, kind.DESCRIPTOR.full_name, kind, message.SerializeToString(), time_s)
 
     def flush_if_due(self, now_s: float) -> None:
         """Write the gathered chunk if it is old enough."""
@@ -143,14 +143,9 @@ class RecordFile:
         self._open_since_s = None
         self._gathered = 0
         self._writer.flush()  # type: ignore[no-untyped-call]
-        self._size = self._file.tell()
+        self._written = self._file.tell()
         if self._synced.done():
             self._sync()
-
-    @property
-    def disk_waits_s(self) -> float:
-        """How long the disk has not answered, seconds; read from any thread."""
-        return 0.0 if self._synced.done() else time.monotonic() - self._sync_since_s
 
     def finish(self, *, wait: bool = True) -> None:
         """Write the index and close the file; wait until it is on the disk, some seconds at most, or not."""
@@ -175,8 +170,14 @@ class RecordFile:
         self._sync_since_s = time.monotonic()
         self._synced = self._disk.submit(os.fdatasync, self._file.fileno())
 
-    def _add(self, topic: str, kind: str, data: bytes, time_s: float) -> None:
-        channel = self._channels.get((topic, kind)) or self._channel(topic, kind)
+    def _add(self, topic: str, schema: str, kind: Any, data: bytes, time_s: float) -> None:
+        channel = self._channels.get((topic, schema))
+        if channel is None:
+            encoding, schema_encoding, text = _encodings(schema, kind)
+            if schema not in self._schemas:
+                self._schemas[schema] = self._writer.register_schema(schema, schema_encoding, text)
+            channel = self._writer.register_channel(topic, encoding, self._schemas[schema])
+            self._channels[topic, schema] = channel
         if self._open_since_s is None:
             self._open_since_s = self.published_s
         self._counts[channel] += 1
@@ -186,11 +187,23 @@ class RecordFile:
         if self._gathered > CHUNK_BYTES:
             self.flush()
 
-    def _channel(self, topic: str, kind: str) -> int:
-        encoding, schema_encoding, data = encodings(kind)
-        if kind not in self._schemas:
-            self._schemas[kind] = self._writer.register_schema(kind, schema_encoding, data)
-        channel = self._channels[topic, kind] = self._writer.register_channel(
-            topic, encoding, self._schemas[kind]
-        )
-        return channel
+
+@cache
+def _encodings(name: str, kind: Any) -> tuple[str, str, bytes]:
+    """The encoding of a kind of message, that of its schema, and the schema."""
+    if (descriptor := getattr(kind, "DESCRIPTOR", None)) is not None:
+        files = FileDescriptorSet()
+        _add_file(files, descriptor.file, set())
+        return MessageEncoding.Protobuf, SchemaEncoding.Protobuf, bytes(files.SerializeToString())
+    schema = {"type": "object"} if kind is None else TypeAdapter(kind).json_schema(mode="serialization")
+    data = json.dumps(schema | {"$schema": DIALECT, "title": name}).encode()
+    return MessageEncoding.JSON, SchemaEncoding.JSONSchema, data
+
+
+def _add_file(files: FileDescriptorSet, file: FileDescriptor, seen: set[str]) -> None:
+    """Add a protobuf message's file with all that it imports, as MCAP wants its schema."""
+    if file.name not in seen:
+        seen.add(file.name)
+        for other in file.dependencies:
+            _add_file(files, other, seen)
+        file.CopyToProto(files.file.add())

@@ -52,7 +52,7 @@ def small(path: Path) -> None:
     """A file of three chunks with nothing but numbers in it."""
     file = RecordFile(path, [CONFIG], {"hardware": "simulated"}, Clocks(0.0, 10**18))
     for number in range(30):
-        file.add_json("/command", "command", {"number": number}, 0.1 * number)
+        file.add_json("/command", {"number": number}, 0.1 * number)
         if number % 10 == 9:
             file.flush()
     file.finish()
