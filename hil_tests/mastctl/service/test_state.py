@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from hil_tests.mastctl.service_fakes import fake_daemon
+from hil_tests.mastctl.service_fakes import fake_daemon, on_disk
 from hil_tests.waiting import until
 from mastctl.client import Client
 from mastctl.control.machine import StandingFault
 from mastctl.devices.frames import StampedFrame
 from mastctl.devices.joint_history import HeadReading
+from mastctl.drift import journal
+from mastctl.panorama.panoramas import Panoramas
 from mastctl.service.service import camera_answer, joints_answer
 
 READING = HeadReading(0.1, -0.2, False, 99.75, true_rad=(0.103, -0.198), approach=(1.0, 0.0))
@@ -45,3 +50,24 @@ def test_each_own_fault_is_published_and_in_the_status(
             assert ("a file", "full") in [(one["device"], one["code"]) for one in client.status()["faults"]]
             assert client.status()["state"] != "fault", "the head is well"
         until(lambda: publisher.newest("fault", "a file") == (), "the fault's end")
+
+
+def test_the_drift_watch_begins_when_all_that_it_reads_is_there(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    defects: list[str] = []
+    monkeypatch.setattr(journal.log, "exception", defects.append)
+    monkeypatch.setattr(Panoramas, "__init__", _slow(Panoramas.__init__))
+    with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
+        on_disk(daemon.service.journals)
+    assert defects == []
+
+
+def _slow(begin: Callable[..., None]) -> Callable[..., None]:
+    """The beginning of a part, on a machine on which other threads come first."""
+
+    def later(*args: Any) -> None:
+        time.sleep(0.2)
+        begin(*args)
+
+    return later
