@@ -16,7 +16,8 @@ import httpx
 import pytest
 import yaml
 from google.protobuf.descriptor import Descriptor
-from google.protobuf.descriptor_pool import Default
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from mcap.reader import make_reader
 
@@ -187,7 +188,10 @@ def test_a_recording_has_every_topic_and_field_of_the_layout(layout: dict[str, A
         for schema, channel, message in make_reader(stream).iter_messages():
             assert schema is not None
             if schema.encoding == "protobuf":
-                kind = Default().FindMessageTypeByName(schema.name)
+                pool = DescriptorPool()
+                for one in FileDescriptorSet.FromString(schema.data).file:
+                    pool.Add(one)
+                kind = pool.FindMessageTypeByName(schema.name)
                 schemas[channel.topic] = kind
                 messages.setdefault(channel.topic, []).append(GetMessageClass(kind).FromString(message.data))
             else:
