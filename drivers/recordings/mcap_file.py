@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
@@ -102,13 +102,6 @@ def read_items(path: Path, found: McapContents | None = None) -> Iterator[Item]:
             yield from _items(file, size, contents)
     except OSError as error:
         raise BadRecording(f"{path}: cannot be read: {error.strerror or error}") from None
-
-
-def read_messages(path: Path, topics: Sequence[str] | None = None) -> Iterator[McapEntry]:
-    """Yield the messages of a file, of all topics or of these. Raises BadRecording."""
-    for item in read_items(path):
-        if isinstance(item, McapEntry) and (topics is None or item.channel.topic in topics):
-            yield item
 
 
 def read_at(path: Path, entry: McapEntry) -> bytes:

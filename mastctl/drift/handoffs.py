@@ -25,7 +25,7 @@ from calib.files.records import Moment, Number, Pair, Record, Text, problem, rea
 from calib.files.yaml_text import plain
 from calib.geometry.handoff import Joints
 from calib.matching.handoff import Landed, MatchedHandoff, RefinedVerdict
-from drivers.recordings.mcap_file import BadRecording, is_mcap, read_messages
+from drivers.recordings.mcap_file import BadRecording, McapEntry, is_mcap, read_items
 from mastctl.drift.journal import Journal
 
 SCHEMA = "mastctl/handoff/1"
@@ -153,7 +153,8 @@ def read_log(path: str | Path) -> ReadLog:
 def _lines_recorded(path: Path) -> bytes:
     """The hand-offs of a recording as lines. Raises BadFile."""
     try:
-        return b"".join(entry.message.data + b"\n" for entry in read_messages(path, (TOPIC,)))
+        entries = (item for item in read_items(path) if isinstance(item, McapEntry))
+        return b"".join(one.message.data + b"\n" for one in entries if one.channel.topic == TOPIC)
     except BadRecording as error:
         raise BadFile(path, "", str(error)) from None
 
