@@ -17,6 +17,7 @@ from calib.plan.poses import candidates
 from calib.targets.boards import Corners
 from mastctl.bench.known import BenchKnowledge
 from mastctl.bench.mast import BenchLook, BenchMast, NotThere
+from mastctl.report.pages import Table
 
 POINTINGS = 4
 
@@ -57,11 +58,23 @@ class Checked:
     @property
     def pointing_promised_px(self) -> float | None:
         """Rms of what was promised of them."""
-        return (
-            float(np.sqrt(np.mean([one.promised_px**2 for one in self.pointings])))
-            if self.pointings
-            else None
-        )
+        squares = [one.promised_px**2 for one in self.pointings]
+        return math.sqrt(np.mean(squares)) if squares else None
+
+    def table(self) -> Table | None:
+        """Return the pointings for a page."""
+        rows = [
+            [
+                f"{one.corner}",
+                f"{one.range_m:.2f}",
+                f"{one.turned_deg:.0f}",
+                *(f"{part:+.3f}" for part in one.residual_px),
+                f"{one.promised_px:.3f}",
+            ]
+            for one in self.pointings
+        ]
+        headings = ("corner", "range m", "turned deg", "residual x px", "y px", "promised sigma px")
+        return Table(headings, rows) if rows else None
 
 
 def unvisited(known: BenchKnowledge, placement: str, count: int) -> Iterator[BenchShot]:

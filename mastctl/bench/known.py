@@ -5,7 +5,9 @@ What is seen goes to the disk first. It is fitted whenever there is half as much
 
 from __future__ import annotations
 
+import itertools
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
@@ -27,10 +29,11 @@ from calib.plan.poses import (
     with_board,
 )
 from calib.survey.records import Survey
+from calib.survey.writer import BenchFolder
 from calib.targets.boards import AnyBoard
 from mastctl.answers import MOST_CELLS, BenchProgress, Coverage
 from mastctl.bench.mast import BenchHead, BenchLook
-from mastctl.bench.survey import RunFolder, fit_in_frame, looks_of, moved_placements
+from mastctl.bench.survey import fit_in_frame, keep_look, look_name, looks_of
 from mastctl.calibration.landing import first_cameras
 
 USUAL_PAN_RAD, USUAL_TILT_RAD = (-1.2, 1.2), (-0.9, 0.3)
@@ -56,16 +59,19 @@ LEAST_PX, LEAST_SCALE = 0.01, 0.1
 class BenchKnowledge:
     """What was seen, and what follows from it.
 
-    ``kept`` is the survey's folder, whose looks are known already; ``say`` shows what a fit refuses. Of the
+    ``folder`` is the survey's, whose looks are known already; ``say`` shows what a fit refuses. Of the
     estimate, ``now`` is the rig with the boards' places, ``sought`` what a shot has to show, ``aim`` and
     ``workspace`` where the rig is to point. ``looks`` are placement, whether it is the check's, and the look,
     in turn; ``shots`` what of them is fitted; ``fitted`` is the last fit, and ``fitted_looks`` how many looks
     it knew.
     """
 
-    def __init__(self, head: BenchHead, kept: RunFolder, board: AnyBoard, say: Callable[[str], None]) -> None:
-        self.head, self.board, self.kept = head, board, kept
-        self._say = say
+    def __init__(
+        self, head: BenchHead, folder: BenchFolder, board: AnyBoard, say: Callable[[str], None]
+    ) -> None:
+        self.head, self.board, self.folder = head, board, folder
+        self._say, survey = say, folder.survey()
+        self._numbers = itertools.count(len(set(map(look_name, survey.images))) + 1)
         self.workspace = Workspace(
             first_cameras(head.rig),
             _within(head.pan_limits_rad, USUAL_PAN_RAD),
@@ -75,12 +81,12 @@ class BenchKnowledge:
         every = board.in_board_m(board.ids)
         least = len(every) if board.kind in ("dots", "checkerboard") else max(8, len(every) // 8)
         self.sought = Sought(
-            every, kept.sigma_px, least, head.pan_limits_rad, head.tilt_limits_rad, head.one_sided
+            every, survey.sigma.corner_px, least, head.pan_limits_rad, head.tilt_limits_rad, head.one_sided
         )
         # A count is rounded both when the head is sent and when it is read.
         self.now = Knowledge(head.rig, {}, head.count_rad / math.sqrt(12.0))
         self.aim: ExpectedPointing = pointing(self.now, self.workspace)
-        self.looks: list[tuple[str, bool, BenchLook]] = list(looks_of(kept.survey()))
+        self.looks: list[tuple[str, bool, BenchLook]] = list(looks_of(survey))
         self.shots: list[BenchShot] = []
         self.fitted: BenchCalibration | None = None
         self.fitted_looks = 0
@@ -106,10 +112,7 @@ class BenchKnowledge:
 
     def pictures(self) -> int:
         """Return how many pictures the camera with most of them has."""
-        counts: dict[str, int] = {}
-        for _, _, look in self.looks:
-            for one in look.found:
-                counts[one.camera] = counts.get(one.camera, 0) + 1
+        counts = Counter(one.camera for _, _, look in self.looks for one in look.found)
         return max(counts.values(), default=0)
 
     def cameras_for(self, name: str) -> list[str]:
@@ -197,7 +200,7 @@ class BenchKnowledge:
 
     def take(self, name: str, look: BenchLook, check: bool = False) -> None:
         """Keep a look at a placement, add it to what is known, and fit if there is much more of it."""
-        self.kept.add(name, look, check)
+        keep_look(self.folder, self.head.rig, name, next(self._numbers), look, check)
         self.looks.append((name, check, look))
         if name not in self.now.boards:
             self.now = replace(self.now, boards={**self.now.boards, name: self._board_from(look)})
@@ -221,9 +224,8 @@ class BenchKnowledge:
         """
         if self.fitted is not None and self.fitted_looks == len(self.looks):
             return self.fitted
-        self._tried_looks, survey = len(self.looks), self.kept.survey()
-        notes, rig = self.kept.notes, self.head.rig
-        self.fitted = fitted = fit_in_frame(survey, None, rig, moved_placements(notes))
+        self._tried_looks, survey, rig = len(self.looks), self.folder.survey(), self.head.rig
+        self.fitted = fitted = fit_in_frame(survey, None, rig)
         self.fitted_looks = len(self.looks)
         body = {n: c for n, c in rig.cameras.items() if c.on == "rover"}
         rig = replace(fitted.rig, cameras={**body, **fitted.rig.cameras})
@@ -236,16 +238,15 @@ class BenchKnowledge:
         return fitted
 
     def believe_boards(self) -> None:
-        """See boards that no fit has placed with the present rig."""
+        """See boards that no fit has placed with the present rig; a placement that a fit left out tells
+        nothing."""
+        boards = dict(self.now.boards)
         for name, _, look in self.looks:
-            if name not in self.now.boards:
-                board = self._board_from(look)
-                self.now = replace(self.now, boards={**self.now.boards, name: board})
-        # What moved, and could not be fitted, tells nothing.
-        fitted = {placement for _, placement in self.fitted.rover_from_board} if self.fitted else set()
-        spoiled = set(moved_placements(self.kept.notes)) - fitted if self.fitted else set()
+            boards.setdefault(name, self._board_from(look))
+        self.now = replace(self.now, boards=boards)
+        placed = {name for _, name in self.fitted.rover_from_board} if self.fitted else set(boards)
         self.shots = [
-            self._shot(name, look) for name, check, look in self.looks if not check and name not in spoiled
+            self._shot(name, look) for name, check, look in self.looks if not check and name in placed
         ]
 
     def _shot(self, name: str, look: BenchLook) -> BenchShot:

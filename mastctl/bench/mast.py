@@ -368,11 +368,6 @@ class SimulatedBoard:
     def __init__(self, client: Client, board: AnyBoard, rig: Rig) -> None:
         self._client, self._board, self._rig = client, board, rig
 
-    @property
-    def is_there(self) -> bool:
-        """Whether the simulation knows the board: a daemon that ended has forgotten it."""
-        return BOARD in self._client.boards()
-
     def stand(self, placement: Placement) -> None:
         """Put the board where it is requested."""
         pose = placement.rover_from_board(self._rig.mast.rover_from_head(0.0, 0.0))

@@ -7,9 +7,6 @@ from there. At its end are images that are not fitted, and pointings at corners,
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
-from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -20,8 +17,6 @@ from calib.errors import CalibError
 from calib.plan.knowledge import BenchShot
 from calib.plan.placements import Advice, Placement, advise, advise_for_body, first_placement
 from calib.plan.poses import AttitudeChoice, next_shot
-from calib.survey.records import Sigma
-from calib.targets.boards import AnyBoard
 from mastctl.answers import BenchProgress, BenchStep
 from mastctl.bench.check import Checked, point_at_corners, unvisited
 from mastctl.bench.known import BenchKnowledge
@@ -29,13 +24,10 @@ from mastctl.bench.mast import (
     BenchInterrupted,
     BenchLook,
     BenchMast,
-    DaemonMast,
     NotThere,
     SimulatedBoard,
     find_board,
 )
-from mastctl.bench.survey import RunFolder
-from mastctl.client import Client
 from mastctl.errors import MastctlError
 
 FEWEST_LOOKS = 8
@@ -76,37 +68,25 @@ class Reporter(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class BenchGoal:
-    """What a run is to reach, and when it stops trying.
-
-    ``pointing_px``: rms per axis of a first pointing that the calibration may leave, on paper;
-    ``pictures`` of a camera, at most, the check's among them.
-    """
-
-    pointing_px: float = 0.2
-    pictures: int = 60
-
-
 class BenchRun:
     """One run; `run` returns when nothing more is wanted.
 
-    ``kept`` is the survey's folder and the run's journal, ``simulated`` the board of a simulated rover.
-    ``known`` is all that was seen, and what follows from it.
+    ``known`` is all that was seen, and what follows from it; ``wanted_px`` the rms per axis of a first
+    pointing that the calibration may leave, on paper; ``most`` pictures of a camera, the check's among them;
+    ``simulated`` the board of a simulated rover.
     """
 
     def __init__(
         self,
         mast: BenchMast,
-        kept: RunFolder,
-        board: AnyBoard,
+        known: BenchKnowledge,
         reporter: Reporter,
-        wanted: BenchGoal,
+        wanted_px: float = 0.2,
+        most: int = 60,
         simulated: SimulatedBoard | None = None,
     ) -> None:
-        self.wanted, self._mast, self._reporter, self._kept = wanted, mast, reporter, kept
-        self._simulated = simulated
-        self.known = BenchKnowledge(mast.head, kept, board, reporter.say)
+        self.known, self._mast, self._reporter, self._simulated = known, mast, reporter, simulated
+        self._wanted_px, self._most = wanted_px, most
         self._current = ""
         """The placement that was worked at, and whose board so stands in place."""
 
@@ -124,7 +104,6 @@ class BenchRun:
             self._reporter.place(name, placement)
             if self._simulated is not None:
                 self._simulated.stand(placement)
-            self._kept.note(event="placement", name=name, requested=asdict(placement))
             self._reporter.step("search")
             known.take(name, find_board(self._mast, known.now, known.sought, self._reporter.say, placement))
             self._work_at(name)
@@ -141,8 +120,9 @@ class BenchRun:
             return Checked({}, ())
         left = CHECKS - sum(1 for _, check, _ in known.looks if check)
         for shot in unvisited(known, name, left):
+            pan_deg, tilt_deg = math.degrees(shot.pan_rad), math.degrees(shot.tilt_rad)
             self._reporter.say(
-                f"an image that is not fitted, at pan {deg(shot.pan_rad)}, tilt {deg(shot.tilt_rad)}"
+                f"an image that is not fitted, at pan {pan_deg:+.0f}, tilt {tilt_deg:+.0f} degrees"
             )
             look = self.look_at(shot)
             if look is not None and look.found:
@@ -163,35 +143,25 @@ class BenchRun:
         known = self.known
         if not known.looks:
             return
-        self._reporter.say(f"going on with {self._kept.path}: {known.pictures()} pictures a camera are there")
+        self._reporter.say(
+            f"going on with {known.folder.path}: {known.pictures()} pictures a camera are there"
+        )
         self._reporter.step("fit")
-        try:
-            known.fit()
-        except CalibError as reason:
-            self._reporter.say(f"not yet enough for a fit: {reason}")
-            known.believe_boards()
+        known.believe_boards()
+        known.try_fit()
         self._report(None)
         name = known.placements()[-1]
-        placement = self._kept.requested(name)
-        if self._simulated is not None and placement is not None and not self._simulated.is_there:
-            self._simulated.stand(placement)
-        if self._kept.is_over(name):
-            return
         if self._stands_still(name):
             self._reporter.say(f"the board stands as it stood in placement {name}")
             self._work_at(name)
         else:
-            self._reporter.say(
-                f"the board does not stand any more as in placement {name}: that one is closed"
-            )
-            self._kept.note(event="done", name=name)
+            self._reporter.say(f"the board does not stand any more as in placement {name}")
 
     def _enough(self) -> bool:
-        known = self.known
-        over = [name for name in known.placements() if self._kept.is_over(name)]
-        if len(over) >= PLACEMENTS[1] or self._looks_left() <= 0:
+        known, placements = self.known, len(self.known.placements())
+        if placements >= PLACEMENTS[1] or self._looks_left() <= 0:
             return True
-        if not over:
+        if not placements:
             return False
         try:
             known.fit()
@@ -199,7 +169,7 @@ class BenchRun:
             raise  # no other placement mends it
         except CalibError as reason:
             self._reporter.say(f"no fit yet: {reason}")
-        if len(over) < PLACEMENTS[0] or self._body_advice() is not None:
+        if placements < PLACEMENTS[0] or self._body_advice() is not None:
             return False
         return known.predicted_px() <= self._target_px()
 
@@ -210,11 +180,11 @@ class BenchRun:
 
     def _looks_left(self) -> int:
         """Looks that may still be taken for the fit."""
-        return self.wanted.pictures - CHECKS - self.known.pictures()
+        return self._most - CHECKS - self.known.pictures()
 
     def _target_px(self) -> float:
         """What the calibration may leave: as requested, or what counts leave anyway."""
-        return max(self.wanted.pointing_px, self.known.counts_px)
+        return max(self._wanted_px, self.known.counts_px)
 
     def _next_placement(self) -> tuple[str, Placement]:
         known, name = self.known, f"p{len(self.known.placements()) + 1}"
@@ -266,29 +236,28 @@ class BenchRun:
                 look = self.look_at(shot)
                 if look is not None and look.found:
                     known.take(name, look)
-        self._end(name)
+        # Once more where the placement began: the fit shows whether board and head stayed there.
+        again = self._again(known.of(name)[0])
+        if again.found:
+            known.take(name, again)
 
     def look_at(self, shot: BenchShot) -> BenchLook | None:
         """Take a shot; None where the head must not go."""
+        approach, cameras = (shot.pan_approach, shot.tilt_approach), self.known.cameras_for(shot.placement)
         try:
-            return self._look(shot, self.known.cameras_for(shot.placement))
+            return self._mast.look(shot.pan_rad, shot.tilt_rad, approach, cameras)
         except NotThere as reason:
             self._reporter.say(f"no image was taken there: {reason}")
             return None
+
+    def _again(self, then: BenchLook) -> BenchLook:
+        return self._mast.look(then.pan_rad, then.tilt_rad, (then.pan_approach, then.tilt_approach))
 
     def _stands_still(self, name: str) -> bool:
         """Whether the last attitude of a placement shows now what it showed then."""
         then = self.known.of(name)[-1]
         apart_px = corners_apart_px(then, self._again(then))
         return apart_px is not None and apart_px <= MOVED_PX
-
-    def _again(self, then: BenchLook) -> BenchLook:
-        """A look taken again, by the cameras that showed the board and those that point."""
-        return self._look(then, {*self.known.workspace.cameras, *(one.camera for one in then.found)})
-
-    def _look(self, where: BenchShot | BenchLook, cameras: Collection[str]) -> BenchLook:
-        approach = where.pan_approach, where.tilt_approach
-        return self._mast.look(where.pan_rad, where.tilt_rad, approach, cameras)
 
     def _suffices(self, taken: int, choice: AttitudeChoice) -> bool:
         if taken < FEWEST_LOOKS:
@@ -300,53 +269,16 @@ class BenchRun:
         last = len(known.placements()) >= PLACEMENTS[1]
         return choice.expected_px > (1.0 - (LAST_GAIN if last else LITTLE_GAIN)) * now_px
 
-    def _end(self, name: str) -> None:
-        """Capture once more where the placement began: the fit shows whether board and head stayed there."""
-        known = self.known
-        again = self._again(known.of(name)[0])
-        if again.found:
-            known.take(name, again)
-        self._kept.note(event="done", name=name)
-
     def _report(self, choice: AttitudeChoice | None) -> None:
         self._reporter.progress(self.known.progress(self._target_px(), choice))
 
 
-def open_run(
-    client: Client,
-    board: AnyBoard,
-    folder: Path,
-    reporter: Reporter,
-    wanted: BenchGoal,
-) -> BenchRun:
-    """Return a run on a daemon's head, which ``client`` may steer, with a new or former survey ``folder``.
-
-    Raises BadFile if the folder holds something else, or another run keeps its looks there; ClientError if
-    the daemon refuses a query.
-    """
-    status = client.status()
-    mast = DaemonMast(client, list(status["cameras"]), board)
-    head = mast.head
-    sigma = Sigma(0.0, 0.0, joint_rad=head.count_rad / 12**0.5, corner_px=0.1)
-    kept = RunFolder(folder, board, sigma, head.rig)
-    kept.begin(client.mast_file())
-    simulated = SimulatedBoard(client, board, head.rig) if status["simulated"] else None
-    return BenchRun(mast, kept, board, reporter, wanted, simulated)
-
-
 def corners_apart_px(then: BenchLook, now: BenchLook) -> float | None:
     """Return how far corners lie apart in two looks from one attitude, median; None if none is common."""
+    before, after = ({one.camera: one.corners for one in look.found if one.corners} for look in (then, now))
     apart: list[float] = []
-    before = {one.camera: one.corners for one in then.found}
-    for one in now.found:
-        old = before.get(one.camera)
-        if old is None or one.corners is None:
-            continue
-        _, a, b = np.intersect1d(old.ids, one.corners.ids, return_indices=True)
-        apart += np.linalg.norm(old.pixels_px[a] - one.corners.pixels_px[b], axis=1).tolist()
+    for camera in before.keys() & after.keys():
+        old, new = before[camera], after[camera]
+        _, a, b = np.intersect1d(old.ids, new.ids, return_indices=True)
+        apart += np.linalg.norm(old.pixels_px[a] - new.pixels_px[b], axis=1).tolist()
     return float(np.median(apart)) if apart else None
-
-
-def deg(angle_rad: float) -> str:
-    """Return an angle as a person reads it."""
-    return f"{math.degrees(angle_rad):+.0f} degrees"

@@ -18,9 +18,12 @@ from calib.plan.placements import Placement
 from calib.targets.board_file import load_board
 from mastctl.answers import BenchProgress, BenchResult, BenchRunRecord, BenchStep
 from mastctl.as_json import as_json
-from mastctl.bench.result import finish
-from mastctl.bench.run import BenchGoal, open_run
+from mastctl.bench.known import BenchKnowledge
+from mastctl.bench.mast import DaemonMast, SimulatedBoard
+from mastctl.bench.result import saved
+from mastctl.bench.run import BenchRun
 from mastctl.bench.runs import HOLDER, BenchJob
+from mastctl.bench.survey import keep_former, open_survey
 from mastctl.client import Client
 from mastctl.errors import error_body, one_line
 
@@ -42,9 +45,18 @@ def work(job: BenchJob, link: Connection) -> None:
             client.use_lease(job.lease_id)
             board = load_board(job.folder.board)
             reporter.change(board_m=list(board.size_m))
-            goal = BenchGoal(job.run["wanted_px"], job.run["most"])
-            bench = open_run(client, board, job.folder.seen, reporter, goal)
-            reporter.done(finish(bench, reporter, job.out, job.folder.page.parent).as_json())
+            mast = DaemonMast(client, list(client.status()["cameras"]), board)
+            folder = open_survey(job.folder.seen, board, mast.head)
+            keep_former(folder.path, client.mast_file())
+            known = BenchKnowledge(mast.head, folder, board, reporter.say)
+            simulated = SimulatedBoard(client, board, mast.head.rig) if job.run["simulated"] else None
+            run = BenchRun(mast, known, reporter, job.run["wanted_px"], job.run["most"], simulated)
+            run.run()
+            reporter.step("check")
+            checked = run.check()
+            reporter.step("fit")
+            report = job.folder.page.parent
+            reporter.done(saved(folder.survey(), known.fit(), mast.head.rig, job.out, report, checked))
     except Exception as error:
         body = error_body(error)
         if body["code"] == "internal":
@@ -103,7 +115,7 @@ class LinkReporter:
     def done(self, document: Mapping[str, Any]) -> None:
         """Send the result; ``document`` is what the command prints with ``--json``."""
         result = {key: document.get(key) for key in BenchResult.__annotations__}
-        self.change(result=result, pictures=document["pictures"])
+        self.change(result=result)
         self.end("done", None, f"verdict: {document['verdict']['words']}")
 
     def end(self, state: str, code: str | None, sentence: str) -> None:

@@ -42,7 +42,7 @@ REFINED = (
     "corrections.*.turn_rad corrections.*.handoffs corrections.*.rms_px corrections.*.unseen "
     "corrections.*.outliers refusals.*.message other_mast"
 )
-FITTED = "rms_px check_rms_px check.pointing_rms_px predicted_px calibrated_px counts_px placements pictures"
+FITTED = "rms_px check_rms_px check.pointing_rms_px calibrated_px counts_px placements pictures"
 """What people see of a correction, and of a bench."""
 
 
@@ -326,7 +326,7 @@ def _again(args: argparse.Namespace) -> Answer:
     from calib.files.mast_file import load_rig
     from calib.survey.reader import read_survey
     from mastctl.bench.result import fit_again
-    from mastctl.bench.survey import former_rig, moved_placements, read_notes
+    from mastctl.bench.survey import former_rig
 
     seen = args.folder / "seen"
     folder = seen if seen.is_dir() else args.folder
@@ -341,8 +341,7 @@ def _again(args: argparse.Namespace) -> Answer:
     if args.model is not None:
         survey = survey.as_model(args.model)
     with output.waiting(args.json, f"fitting {len(survey.images)} images"):
-        former, moved = former_rig(folder), moved_placements(read_notes(folder))
-        document = fit_again(survey, args.out, args.report, mast_at, former, moved).as_json()
+        document = fit_again(survey, args.out, args.report, mast_at, former_rig(folder))
     models, lines = _compared(args, survey)
     return Answer(document | models, [*_bench_shown(document), *lines])
 

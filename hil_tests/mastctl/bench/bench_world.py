@@ -11,12 +11,12 @@ import numpy as np
 
 from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
-from calib.survey.records import Sigma
 from calib.targets.boards import Charuco
 from hil_tests.mastctl.bench.bench_of_corners import CornerBench, SelfPlacing, TrueAxis
+from mastctl.bench.known import BenchKnowledge
 from mastctl.bench.mast import BenchHead, BenchMast
-from mastctl.bench.run import BenchGoal, BenchRun, Reporter
-from mastctl.bench.survey import RunFolder
+from mastctl.bench.run import BenchRun, Reporter
+from mastctl.bench.survey import open_survey
 
 BOARD = Charuco(10, 7, 0.055, 0.042)
 PAIR = ("navcam_left", "navcam_right")
@@ -54,21 +54,11 @@ def corner_bench(
     return CornerBench(head, true, BOARD, np.random.default_rng(seed), pan, tilt)
 
 
-def kept_in(folder: Path, bench: CornerBench) -> RunFolder:
-    """The run's folder."""
-    sigma = Sigma(0.0, 0.0, joint_rad=PTU_COUNT_RAD / 12**0.5, corner_px=bench.noise_px)
-    return RunFolder(folder, BOARD, sigma, bench.head.rig)
-
-
 def run_of(
-    bench: CornerBench,
-    folder: Path,
-    wanted: BenchGoal | None = None,
-    mast: BenchMast | None = None,
-    reporter: Reporter | None = None,
+    bench: CornerBench, folder: Path, mast: BenchMast | None = None, reporter: Reporter | None = None
 ) -> tuple[BenchRun, SelfPlacing]:
     """A run, and the person that places its board; ``mast`` and ``reporter`` instead of the bench's own."""
     person = SelfPlacing(bench)
-    kept = kept_in(folder, bench)
-    run = BenchRun(mast or bench, kept, BOARD, reporter or person, wanted or BenchGoal())
-    return run, person
+    survey = open_survey(folder, BOARD, bench.head, bench.noise_px)
+    known = BenchKnowledge(bench.head, survey, BOARD, (reporter or person).say)
+    return BenchRun(mast or bench, known, reporter or person), person

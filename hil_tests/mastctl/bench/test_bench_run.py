@@ -93,7 +93,6 @@ def test_a_run_that_died_goes_on_at_its_placement_without_a_request(repository: 
     run, _ = run_of(bench, tmp_path / "bench", mast=Mortal(bench, 5))  # dies in the first placement
     with pytest.raises(Dying):
         run.run()
-    run._kept.let_go()
     before = list(looks_of(read_survey(tmp_path / "bench")))
     again, second = run_of(bench, tmp_path / "bench", mast=Mortal(bench, 3))  # its end is that of any run
     with pytest.raises(Dying):
@@ -133,11 +132,3 @@ def test_a_folder_of_another_board_is_refused(repository: Path, tmp_path: Path) 
         CalibError, match=r"sigma\.corner_px: is 0\.05, now it would be 0\.11; another folder"
     ):
         run_of(bench, tmp_path / "bench")
-
-
-def test_two_runs_do_not_keep_their_looks_in_one_folder(repository: Path, tmp_path: Path) -> None:
-    run, _ = run_of(corner_bench(repository), tmp_path / "bench")
-    with pytest.raises(CalibError, match="another run keeps its looks there"):
-        run_of(corner_bench(repository), tmp_path / "bench")
-    run._kept.let_go()
-    run_of(corner_bench(repository), tmp_path / "bench")

@@ -64,7 +64,6 @@ def test_a_run_outlives_its_killed_daemon_only_as_a_folder_to_go_on(tmp_path: Pa
         (program,) = workers(daemon.pid)
         run = client.bench()["run"]
         assert run is not None and any("going on with" in sentence for sentence in run["sentences"])
-        assert run["placements"] == 1, "it works at the placement of before"
         client.stop()
         until(lambda: client.bench()["runs"][0]["state"] == "interrupted", "it has ended", BOUND_S)
         run = client.bench()["run"]
