@@ -233,12 +233,15 @@ def _snapshot(args: argparse.Namespace) -> Answer:
 )
 def _ros2(args: argparse.Namespace) -> int:
     from mastctl.client import Client
-    from mastctl.ros2.adapter import check_ros, run
+    from mastctl.ros2 import check_ros
 
     for name, text in (("--prefix", args.prefix), ("--base", args.base)):
         if not ROS_NAME.fullmatch(text) and (name == "--base" or text):
             raise WrongUse(f"{name} is '{text}' where a word of letters, digits and _ is expected")
     check_ros()
+    from mastctl.ros2.node import run
+    from mastctl.ros2.state import RosNames
+
     with client_of(args) as client:
         url = client.url
     client_name = f"ros2@{os.uname().nodename}:{os.getpid()}"
@@ -246,8 +249,7 @@ def _ros2(args: argparse.Namespace) -> int:
     with suppress(KeyboardInterrupt), signals.raised():
         run(
             lambda: Client(url, timeout_s=10.0, name=client_name),
-            args.prefix,
-            args.base,
+            RosNames(args.prefix, args.base),
             args.ros_args,
             lambda node: output.show(args, Answer({"node": node, "url": url}, f"{node} is a node of {url}")),
         )

@@ -1,4 +1,4 @@
-"""What ROS wants of the head: messages as goals, carried out one at a time under a lease of their own.
+"""What ROS wants of the head: goals, carried out one at a time under a lease of their own, and the actions.
 
 A goal is an operation of the daemon: joint angles, a point of the rover frame, or a pixel. A new goal takes
 the place of the one before, which is stopped first. The lease runs from a goal's beginning to its end and is
@@ -11,24 +11,24 @@ import contextlib
 import logging
 import math
 import threading
+import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
-import numpy as np
-
 from mastctl.client import Client, ClientError
-from mastctl.ros2.state import FRAMES, DaemonState, RosNames
-from mastctl.ros2.tf_tree import NS, NoTransform, stamp_ns
+from mastctl.client.connection import polled
+from mastctl.ros2.state import DaemonState, RosNames
 
 log = logging.getLogger(__name__)
 
 LEASE_S = 2.0
-WAIT_S = 600.0
-"""Longest time of one goal; the daemon's own deadline is sooner."""
-TF_WAIT_S = 1.0
-FAR_M = 1e6
+WAIT_S = 600.0  # longest time of one goal; the daemon's own deadline is sooner
+UNSEEN_S, GONE_S = 10.0, 0.1
+"""How long an action's client is awaited that ROS may report later than its goal, and one that was there."""
+ENDED = ("done", "failed", "stopped")
+TRAJECTORY, POINT_HEAD = "follow_joint_trajectory", "point_head"
 
 
 @dataclass(frozen=True)
@@ -44,25 +44,21 @@ class GoalOutcome:
     operation: Mapping[str, Any] | None = None
 
 
-ENDED = GoalOutcome("stopped", message="the adapter ends")
-REPLACED = GoalOutcome("replaced", message="a newer goal came")
-
-
 @dataclass(eq=False)
 class Goal:
     """One goal of ROS; ``name`` is for logs.
 
     ``request`` returns the arguments of `Client.point`; it may wait, and raises ValueError with a sentence.
+    ``meanwhile`` is called while the goal runs, some twenty times a second; False ends it.
     """
 
     name: str
     request: Callable[[Client], Mapping[str, Any]]
-    outcome: Future[GoalOutcome] = field(default_factory=Future)
-    withdrawn: bool = False
+    meanwhile: Callable[[], bool] = lambda: True
 
 
 class RosSteering:
-    """Carries out goals in a thread of its own; `close` stops what runs.
+    """Carries out goals, each in its caller's thread; `close` ends them.
 
     ``connect`` makes a client of the daemon.
     """
@@ -70,77 +66,51 @@ class RosSteering:
     def __init__(self, connect: Callable[[], Client]) -> None:
         self._connect = connect
         self._changed = threading.Condition()
-        self._next: Goal | None = None
-        self._now: Goal | None = None
-        self._operation = ""  # of the daemon, for what runs now
+        self._wanted: Goal | None = None  # the newest one; any other that waits or runs ends
+        self._runs = False
         self._closed = False
-        self._thread = threading.Thread(target=self._work, name="steering", daemon=True)
-        self._thread.start()
 
-    def begin(self, goal: Goal) -> None:
-        """Take a goal; what runs is stopped for it, and what waited is replaced."""
+    def carry_out(self, goal: Goal) -> GoalOutcome:
+        """Stop the goal that runs, carry this one out, and return how it ended."""
         with self._changed:
-            replaced, outcome = (goal, ENDED) if self._closed else (self._next, REPLACED)
-            if not self._closed:
-                self._next = goal
-                self._changed.notify_all()
-        if replaced is not None:
-            self._end(replaced, outcome)
-        self._stop_running()
-
-    def withdraw(self, goal: Goal) -> None:
-        """Stop a goal, or never begin it."""
-        with self._changed:
-            waits = self._next is goal
-            if waits:
-                self._next = None
-            goal.withdrawn, runs = True, self._now is goal
-        if waits:
-            self._end(goal, GoalOutcome("stopped", message="it was canceled"))
-        elif runs:
-            self._stop_running()
+            self._wanted = None if self._closed else goal
+            self._changed.notify_all()
+            self._changed.wait_for(lambda: self._superseded(goal) or not self._runs)
+            runs = self._runs = not self._superseded(goal)
+        outcome = self._replaced()
+        if runs:
+            try:
+                outcome = self._leased(goal)
+            finally:
+                with self._changed:
+                    self._runs = False
+                    self._changed.notify_all()
+        if outcome.state != "done":
+            log.warning("%s: %s %s", goal.name, outcome.state, outcome.message)
+        return outcome
 
     def stop(self) -> None:
         """Stop what runs; what waits is never begun."""
-        for goal in (self._next, self._now):
-            if goal is not None:
-                self.withdraw(goal)
+        with self._changed:
+            self._wanted = None
+            self._changed.notify_all()
 
     def close(self) -> None:
         """Stop what was begun, and wait until the lease is given back."""
         with self._changed:
             self._closed = True
-            waiting, self._next = self._next, None
-            self._changed.notify_all()
-        if waiting is not None:
-            self._end(waiting, ENDED)
-        self._stop_running()
-        self._thread.join()
-
-    def _stop_running(self) -> None:
-        """Stop what ROS has begun, and nothing else: the head may be another client's by now."""
-        operation = self._operation
-        if operation:
-            with contextlib.suppress(ClientError), self._connect() as client:
-                client.stop_operation(operation)
+            self.stop()
+            self._changed.wait_for(lambda: not self._runs)
 
     def _superseded(self, goal: Goal) -> bool:
-        return self._closed or self._next is not None or goal.withdrawn
+        return self._wanted is not goal
 
-    def _work(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._closed or self._next is not None)
-                if self._next is None:
-                    return
-                goal, self._next = self._next, None
-                self._now = goal
-            outcome = self._carried_out(goal)
-            with self._changed:
-                self._now, self._operation = None, ""
-            self._end(goal, outcome)
+    def _replaced(self) -> GoalOutcome:
+        if self._wanted is None:
+            return GoalOutcome("stopped", message="it was canceled, or the adapter ends")
+        return GoalOutcome("replaced", message="a newer goal came")
 
-    def _carried_out(self, goal: Goal) -> GoalOutcome:
+    def _leased(self, goal: Goal) -> GoalOutcome:
         try:
             with self._connect() as client:
                 request = goal.request(client)
@@ -150,121 +120,169 @@ class RosSteering:
             return GoalOutcome("refused", "bad_request", str(error))
         except ClientError as error:
             return GoalOutcome("refused", error.code, str(error))
-        except Exception:  # the thread goes on: the next goal, and the stop at the end, need it
+        except Exception:  # the next goal, and the stop at the end, come all the same
             log.exception("'%s' met a defect of the program", goal.name)
             return GoalOutcome("failed", "defect", "a defect of the program; the log has it")
 
     def _pointed(self, client: Client, goal: Goal, request: Mapping[str, Any]) -> GoalOutcome:
         if self._superseded(goal):
-            return REPLACED
-        operation = self._operation = client.point(**request)
-        if self._superseded(goal):  # it came before this one could be stopped
-            client.stop_operation(operation)
+            return self._replaced()
+        operation, stopped = client.point(**request), False
         try:
-            record = client.wait(operation, WAIT_S)
+            for record in polled(lambda within_s: client.operation(operation), WAIT_S):
+                if record["state"] in ENDED:
+                    reason = record["error"] or {"code": "", "message": ""}
+                    return GoalOutcome(record["state"], reason["code"], reason["message"], record)
+                if not stopped and (self._superseded(goal) or not goal.meanwhile()):
+                    client.stop_operation(operation)
+                    stopped = True
+            raise ClientError("timeout", f"operation {operation} has not ended after {WAIT_S:g} s")
         except ClientError as error:
             log.warning("lost sight of '%s' (%s); the head is stopped", goal.name, error)
             with contextlib.suppress(ClientError):
                 client.stop_operation(operation)
             return GoalOutcome("failed", error.code, str(error))
-        reason = record["error"] or {"code": "", "message": ""}
-        return GoalOutcome(record["state"], reason["code"], reason["message"], record)
-
-    def _end(self, goal: Goal, outcome: GoalOutcome) -> None:
-        if outcome.state != "done":
-            log.warning("%s: %s %s", goal.name, outcome.state, outcome.message)
-        goal.outcome.set_result(outcome)
 
 
-# Messages as arguments of Client.point; each raises ValueError with a sentence
+class Actions:
+    """The actions ``FollowJointTrajectory`` and ``PointHead`` of a node, where control_msgs is installed.
 
+    Their goals are goals like those of topics, which ``carry_out`` gets.
+    """
 
-def angles_of(trajectory: Any, names: RosNames, client: Client) -> dict[str, float]:
-    """Return the joint angles of a trajectory's last point; a joint that it leaves out stays."""
-    keys = {names.pan: "pan_rad", names.tilt: "tilt_rad"}
-    given = list(trajectory.joint_names)
-    if not given or len(set(given)) != len(given) or not set(given) <= set(keys):
-        known = " and ".join(keys)
-        raise ValueError(f"the trajectory names the joints {given} where {known} are expected, once each")
-    if not trajectory.points:
-        raise ValueError("the trajectory has no point")
-    last = list(trajectory.points[-1].positions)
-    if len(last) != len(given):
-        raise ValueError(f"the last point has {len(last)} positions for {len(given)} joints")
-    if not all(map(math.isfinite, last)):
-        raise ValueError(f"the last point's positions are {last} where finite radians are expected")
-    joints = client.status()["joints"]
-    if joints is None and len(given) < 2:
-        raise ValueError("the head was not read yet; a trajectory of both joints is expected")
-    stays = {} if joints is None else {"pan_rad": joints["pan_rad"], "tilt_rad": joints["tilt_rad"]}
-    return stays | {keys[name]: float(value) for name, value in zip(given, last, strict=True)}
+    def __init__(
+        self,
+        node: Any,
+        names: RosNames,
+        state: DaemonState,
+        carry_out: Callable[[Goal], GoalOutcome],
+    ) -> None:
+        self._node, self._names, self._state, self._carry_out = node, names, state, carry_out
+        from rclpy.action import ActionServer, CancelResponse
+        from rclpy.callback_groups import ReentrantCallbackGroup
 
+        from mastctl.ros2 import messages
 
-def point_of(message: Any, names: RosNames, state: DaemonState) -> dict[str, Any]:
-    """Return the point in the rover frame, metres, of a ``PointStamped`` of any frame that tf knows."""
-    frame = message.header.frame_id.lstrip("/")
-    point = [float(message.point.x), float(message.point.y), float(message.point.z)]
-    if not all(map(math.isfinite, point)):
-        raise ValueError(f"the point is {point} where finite meters are expected")
-    if not frame:
-        raise ValueError("the point's header has no frame_id")
-    if frame != names.rover:
-        at_ns = stamp_ns(message.header.stamp)
+        self._messages = messages
         try:
-            point = state.tree.transform(names.rover, frame, at_ns, TF_WAIT_S).points(point).tolist()
-        except NoTransform as error:
-            raise ValueError(str(error)) from None
-    return {"position_m": point, "frame": "rover"}
+            kinds = import_module("control_msgs.action")
+        except ImportError:
+            log.warning("control_msgs is not installed: there are no actions, only topics and services")
+            return
+        self._trajectory, self._point_head = kinds.FollowJointTrajectory, kinds.PointHead
+        group = ReentrantCallbackGroup()
+        self._servers = [
+            ActionServer(
+                node, kind, name, execute, callback_group=group,
+                cancel_callback=lambda goal: CancelResponse.ACCEPT,
+            )
+            for kind, name, execute in (
+                (self._trajectory, TRAJECTORY, self._follow),
+                (self._point_head, POINT_HEAD, self._point),
+            )
+        ]  # fmt: skip
+
+    def _follow(self, goal: Any) -> Any:
+        """Go to the last point of the goal's trajectory; the goal is over when the head rests there."""
+        fields, result = goal.request, self._trajectory.Result()
+        wanted: dict[str, float] = {}
+
+        def request(client: Client) -> dict[str, Any]:
+            if fields.multi_dof_trajectory.points or not fields.trajectory.points:
+                raise ValueError("the goal has no trajectory of the joints pan and tilt")
+            wanted.update(self._messages.angles_of(fields.trajectory, self._names, client))
+            return wanted | _deadline(fields)
+
+        outcome = self._carried_out(TRAJECTORY, goal, request, lambda: self._feedback(goal, wanted))
+        result.error_string = outcome.message
+        off = self._beyond(fields.goal_tolerance, wanted) if outcome.state == "done" else ""
+        if off:
+            result.error_code, result.error_string = result.GOAL_TOLERANCE_VIOLATED, off
+            goal.abort()
+        else:
+            result.error_code = result.SUCCESSFUL if outcome.state == "done" else result.INVALID_GOAL
+            _end(goal, outcome)
+        return result
+
+    def _point(self, goal: Any) -> Any:
+        """Point a camera at the goal's point; the goal is over when the residual was measured."""
+        fields = goal.request
+
+        def request(client: Client) -> dict[str, Any]:
+            limit = client.status()["limits"]["speed_rad_per_s"]
+            if 0.0 < fields.max_velocity < limit:
+                raise ValueError(
+                    f"max_velocity is {fields.max_velocity:g} rad/s where the daemon's own speed, {limit:g}, "
+                    "or 0 is expected; limits.speed_rad_per_s of its configuration sets it"
+                )
+            axis = fields.pointing_axis
+            aim = self._messages.aim_of(
+                fields.pointing_frame, (axis.x, axis.y, axis.z), self._names, self._state
+            )
+            point: dict[str, Any] = self._messages.point_of(fields.target, self._names, self._state)
+            return point | aim
+
+        _end(goal, self._carried_out(POINT_HEAD, goal, request, lambda: None))
+        return self._point_head.Result()
+
+    def _carried_out(
+        self,
+        name: str,
+        goal: Any,
+        request: Callable[[Client], Mapping[str, Any]],
+        feedback: Callable[[], object],
+    ) -> GoalOutcome:
+        """Carry a goal out with feedback; it ends when it is canceled, or when its client is gone."""
+        service = self._node.resolve_service_name(f"{name}/_action/get_result")
+        until_s = time.monotonic() + UNSEEN_S
+
+        def meanwhile() -> bool:
+            nonlocal until_s
+            now_s = time.monotonic()
+            if self._node.count_clients(service):
+                until_s = now_s + GONE_S
+            feedback()
+            return not goal.is_cancel_requested and now_s <= until_s
+
+        return self._carry_out(Goal(name, request, meanwhile))
+
+    def _feedback(self, goal: Any, wanted: Mapping[str, float]) -> None:
+        """Publish where the joints are, and where they are wanted."""
+        joints = self._state.joints
+        if joints is not None:
+            at_ns = self._state.clock.stamp_ns(joints["measured_s"]) or 0
+            goal.publish_feedback(
+                self._messages.feedback(self._trajectory.Feedback, self._names, at_ns, wanted, joints)
+            )
+
+    def _beyond(self, tolerances: Any, wanted: Mapping[str, float]) -> str:
+        """Which joint is farther from its goal than the goal's tolerance, in a sentence."""
+        joints = self._state.joints
+        for one in tolerances:
+            key = self._names.joints.get(one.name)
+            if joints is None or key is None or not one.position > 0.0:
+                continue
+            off_rad = abs(float(joints[key]) - wanted[key])
+            if off_rad > one.position:
+                return f"{one.name} is {off_rad:.6f} rad from its goal where {one.position:g} is allowed"
+        return ""
 
 
-def pixel_of(message: Any, names: RosNames, state: DaemonState) -> dict[str, Any]:
-    """Return the pixel of a named frame of a ``PointStamped``: x, y pixels, z the range, metres, or 0.
-
-    Its frame is a camera's optical one, and its stamp that of the image.
-    """
-    at_ns = stamp_ns(message.header.stamp)
-    x_px, y_px, range_m = float(message.point.x), float(message.point.y), float(message.point.z)
-    if not (all(map(math.isfinite, (x_px, y_px, range_m))) and range_m >= 0.0):
-        raise ValueError(
-            f"the point is {[x_px, y_px, range_m]} where a pixel and a range (meters, or 0) are expected"
-        )
-    if state.rig is None:
-        raise ValueError("the daemon's mast file cannot be read, so that its cameras are not known")
-    frame = message.header.frame_id.lstrip("/")
-    camera = names.camera_of(frame, state.rig)
-    if camera is None:
-        raise ValueError(f"the frame '{frame}' is no camera's; one ends with _optical_frame")
-    frame_id = state.frame_at(camera, at_ns)
-    if frame_id is None:
-        raise ValueError(
-            f"none of the last {FRAMES} images of {camera} has the stamp {at_ns / NS:.9f} s; "
-            "the stamp of the image that shows the point is expected"
-        )
-    return {"pixel": (camera, frame_id, x_px, y_px)} | ({"range_m": range_m} if range_m else {})
+def _end(goal: Any, outcome: GoalOutcome) -> None:
+    if outcome.state == "done":
+        goal.succeed()
+    elif goal.is_cancel_requested and outcome.state in ("stopped", "replaced"):
+        goal.canceled()
+    else:
+        goal.abort()
 
 
-def aim_of(
-    frame: str, axis: tuple[float, float, float], names: RosNames, state: DaemonState
-) -> dict[str, Any]:
-    """Return the aim of a ``PointHead``: where a camera shows what lies along an axis of its frame.
+def _deadline(fields: Any) -> dict[str, float]:
+    """How long a goal may take, where it has a tolerance of time: until its last point and that."""
+    late_s = _seconds(fields.goal_time_tolerance)
+    whole_s = _seconds(fields.trajectory.points[-1].time_from_start) + late_s
+    return {"deadline_s": whole_s} if late_s > 0.0 and math.isfinite(whole_s) else {}
 
-    Without a frame the daemon chooses; without an axis it is the image's centre.
-    """
-    if not frame:
-        return {}
-    rig = state.rig
-    on_head = [] if rig is None else [name for name, one in rig.cameras.items() if one.on == "head"]
-    camera = next((name for name in on_head if names.optical(name) == frame.lstrip("/")), None)
-    if rig is None or camera is None:
-        known = [names.optical(name) for name in on_head]
-        raise ValueError(f"pointing_frame is '{frame}' where one of {known} is expected")
-    model = rig.cameras[camera].model
-    if not any(axis):
-        return {"aim": (camera, *model.image_center_px)}
-    if not all(map(math.isfinite, axis)):
-        raise ValueError(f"pointing_axis is {list(axis)} where finite numbers are expected")
-    along = state.carrier_from_optical(rig, camera).rotation @ (np.array(axis) / np.linalg.norm(axis))
-    pixel, valid = model.project(model.C + FAR_M * along)
-    if not valid:
-        raise ValueError(f"the camera does not see along pointing_axis {list(axis)}")
-    return {"aim": (camera, *pixel.tolist())}
+
+def _seconds(duration: Any) -> float:
+    return float(duration.sec) + 1e-9 * float(duration.nanosec)

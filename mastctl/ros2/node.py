@@ -1,4 +1,4 @@
-"""The node: what it publishes of the daemon, and what it takes for it."""
+"""The node: what it publishes of the daemon, and what it takes for it; `run` joins it with ROS."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ import threading
 import time
 from array import array
 from collections import deque
-from collections.abc import Callable, Mapping
-from concurrent.futures import Future
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from typing import Any
 
@@ -16,10 +15,12 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, TransformStamped, Vector3Stamped
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, CompressedImage, JointState
-from std_msgs.msg import Float64, Header
+from std_msgs.msg import Float64
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
@@ -28,11 +29,9 @@ from calib.files import digest_of
 from calib.files.mast_file import parse_rig
 from mastctl.client import Client, ClientError
 from mastctl.client.pictures import LivePicture
-from mastctl.ros2 import messages
-from mastctl.ros2.actions import Actions
-from mastctl.ros2.goals import Goal, GoalOutcome, RosSteering, angles_of, pixel_of, point_of
-from mastctl.ros2.state import ClockExchange, DaemonState, RosNames, real_from_monotonic_ns
-from mastctl.ros2.tf_tree import NS, stamp_ns
+from mastctl.ros2 import NoRos, messages
+from mastctl.ros2.goals import ENDED, Actions, Goal, GoalOutcome, RosSteering
+from mastctl.ros2.state import NS, ClockExchange, DaemonState, RosNames, real_from_monotonic_ns
 
 log = logging.getLogger(__name__)
 
@@ -45,11 +44,43 @@ LATCHED, MANY_LATCHED = (
 RELIABLE, TF = (QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE) for depth in (10, 100))
 REASON = "reset_reason"
 NAME = "ROS 2"
-ENDED = ("done", "failed", "stopped")
-ENDS = 1000
-"""Operations whose end is remembered; the daemon itself keeps some 200."""
-AGAIN_S, STATUS_S, PICTURE_S = 1.0, 1.0, 0.1
-"""Between attempts to reach the daemon, between queries of its status, and the wait for a picture."""
+THREADS = 6  # of ROS's callbacks: the goal that runs, those that it gives way to, the services beside them
+ENDS = 1000  # operations whose end is remembered; the daemon itself keeps some 200
+AGAIN_S, STATUS_S = 1.0, 1.0  # between attempts to reach the daemon, and between queries of its status
+PICTURE_S, SPIN_S = 0.1, 0.1  # how long a picture, and ROS, are waited for until the end is noticed
+
+
+def run(
+    connect: Callable[[], Client],
+    names: RosNames,
+    ros_args: Sequence[str],
+    ready: Callable[[str], object],
+) -> None:
+    """Run the node until an exception, a signal's KeyboardInterrupt as a rule; stops what ROS began.
+
+    ``connect`` makes a client of the daemon; ``ros_args`` follow ``--ros-args``; ``ready`` gets the node's
+    name when it is there. Raises NoRos if ROS refuses its arguments, or ends; ClientError if the daemon does
+    not answer at the beginning.
+    """
+    try:
+        rclpy.init(args=["mastctl", "--ros-args", *ros_args], signal_handler_options=SignalHandlerOptions.NO)
+        node = MastNode(connect, names)
+    except Exception as error:  # of many kinds: arguments, a middleware that is not there
+        raise NoRos(f"ROS cannot begin: {error}") from None
+    executor = MultiThreadedExecutor(THREADS)
+    executor.add_node(node)
+    try:
+        node.begin()
+        ready(node.get_fully_qualified_name())
+        while rclpy.ok():
+            executor.spin_once(SPIN_S)
+        raise NoRos("ROS has ended")
+    except ExternalShutdownException:
+        raise NoRos("ROS has ended") from None
+    finally:
+        node.close()
+        executor.shutdown(timeout_sec=1.0)
+        rclpy.try_shutdown()
 
 
 class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has it
@@ -72,7 +103,7 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         self._make_publishers()
         self.steering = RosSteering(connect)
         self._subscribe()
-        self._actions = Actions(self, names, self.state, self.steering, self._begin_goal)
+        self._actions = Actions(self, names, self.state, self._carry_out)
 
     def begin(self) -> None:
         """Follow the daemon from now on. Raises ClientError if it does not answer, or is refused."""
@@ -210,9 +241,11 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
     def _put(self, one: TransformStamped, static: bool) -> None:
         parent, child = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
         try:
-            self.state.tree.put(parent, child, stamp_ns(one.header.stamp), messages.rigid(one), static)
+            rigid = messages.rigid(one)
         except ValueError as error:
             log.warning("a transform of tf is left out: %s", error)
+        else:
+            self.state.tree.put(parent, child, messages.ns_of(one.header.stamp), rigid, static)
 
     def _publish_joints(self, joints: dict[str, Any]) -> None:
         at_ns = self.state.clock.stamp_ns(joints["measured_s"])
@@ -220,13 +253,7 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         rig = self.state.rig
         if at_ns is None or rig is None:
             return
-        self._joint_states.publish(
-            JointState(
-                header=Header(stamp=messages.stamp(at_ns)),
-                name=[self.names.pan, self.names.tilt],
-                position=[joints["pan_rad"], joints["tilt_rad"]],
-            )
-        )
+        self._joint_states.publish(messages.joint_state(self.names, at_ns, joints))
         true_rad = joints["true_pan_rad"], joints["true_tilt_rad"]
         self._publish_transforms(messages.moving_transforms(self.names, rig, at_ns, *true_rad), False)
 
@@ -237,7 +264,7 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         if record["residual_px"] is None:
             return
         camera = next((one["camera"] for one in reversed(record["pointings"])), "")
-        header = Header(stamp=messages.stamp(at_ns), frame_id=self.names.optical(camera))
+        header = messages.header(at_ns, self.names.optical(camera))
         self._sigma.publish(messages.residual(header, record["residual_sigma_px"] or (None, None)))
         self._residual.publish(messages.residual(header, record["residual_px"]))
 
@@ -252,7 +279,7 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         camera = facts["camera"]
         self.state.put_image(camera, at_ns, facts["frame_id"])
         image, info = self._images[camera]
-        header = Header(stamp=messages.stamp(at_ns), frame_id=self.names.optical(camera))
+        header = messages.header(at_ns, self.names.optical(camera))
         jpeg = array("B", picture.jpeg)  # bytes are checked one by one
         image.publish(CompressedImage(header=header, format="jpeg", data=jpeg))
         if camera in self._infos:
@@ -294,15 +321,20 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
 
         def trajectory(message: Any) -> None:
             if message.points:
-                self._begin_goal("joint_trajectory", lambda client: angles_of(message, self.names, client))
+                request = lambda client: messages.angles_of(message, self.names, client)  # noqa: E731
+                self._carry_out(Goal("joint_trajectory", request))
             else:
                 self.steering.stop()
 
         def point_at(message: Any) -> None:
-            self._begin_goal("point_at", lambda client: point_of(message, self.names, self.state))
+            self._carry_out(
+                Goal("point_at", lambda client: messages.point_of(message, self.names, self.state))
+            )
 
         def point_at_pixel(message: Any) -> None:
-            self._begin_goal("point_at_pixel", lambda client: pixel_of(message, self.names, self.state))
+            self._carry_out(
+                Goal("point_at_pixel", lambda client: messages.pixel_of(message, self.names, self.state))
+            )
 
         for kind, topic, take in (
             (JointTrajectory, "joint_trajectory", trajectory),
@@ -314,19 +346,13 @@ class MastNode(Node):  # type: ignore[misc]  # rclpy has types for whoever has i
         for name, answer in services:
             self.create_service(Trigger, f"~/{name}", answer, callback_group=group)
 
-    def _begin_goal(self, name: str, request: Callable[[Client], Mapping[str, Any]]) -> Goal:
-        goal = Goal(name, request)
-
-        def end(future: Future[GoalOutcome]) -> None:
-            outcome = future.result()
-            if outcome.operation is None:  # it never became an operation, whose end is published
-                self._pointings.publish(
-                    messages.pointing(self.now_ns(), name, outcome.state, outcome.message, None)
-                )
-
-        goal.outcome.add_done_callback(end)
-        self.steering.begin(goal)
-        return goal
+    def _carry_out(self, goal: Goal) -> GoalOutcome:
+        """Carry a goal out; one that never became an operation, whose end is published, is published here."""
+        outcome = self.steering.carry_out(goal)
+        if outcome.operation is None:
+            array = messages.pointing(self.now_ns(), goal.name, outcome.state, outcome.message, None)
+            self._pointings.publish(array)
+        return outcome
 
     def _stop(self, request: Any, answer: Any) -> Any:
         try:

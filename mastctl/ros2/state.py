@@ -1,4 +1,4 @@
-"""What the node knows of its daemon, the names it has in ROS, and ROS time of the daemon's times.
+"""What the node knows: its daemon, the names it has in ROS, ROS time of the daemon's times, and tf.
 
 A stamp is the daemon's CLOCK_MONOTONIC time plus an offset, in whole nanoseconds. On the daemon's own machine
 the offset is that of two clocks of this machine, and no message is part of it. Elsewhere it comes from the
@@ -9,39 +9,42 @@ from __future__ import annotations
 
 import logging
 import re
+import threading
 import time
+from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib.files.any_camera import nearest_lens
 from calib.files.twin import TwinError
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid
-from mastctl.ros2.tf_tree import NS, TfTree
 
 log = logging.getLogger(__name__)
 
-STEP_S = 1e-3
-"""A smaller change of the offset is not reported; on one machine only a set clock is larger."""
+NS = 1_000_000_000
+STEP_S = 1e-3  # a smaller change of the offset is not reported; on one machine only a set clock is larger
 SAME_S = 1e-4
 EXCHANGES = 30
-CALM = 60
-"""Exchanges without a step after which the offset is steady again."""
-
-FRAMES = 64
-"""Images of a camera whose stamps still name them; the daemon itself keeps some 32."""
+CALM = 60  # exchanges without a step after which the offset is steady again
+FRAMES = 64  # images of a camera whose stamps still name them; the daemon itself keeps some 32
+KEPT_NS = 10 * NS
+MOST_FRAMES = 100
 
 
 class RosNames:
     """The names of joints and frames; ``prefix`` stands before each but the ``base``'s, which has ROS's
-    axes."""
+    axes. ``joints``: by their names the keys of the daemon's."""
 
     def __init__(self, prefix: str = "", base: str = "base_link") -> None:
         self.base = base
-        self.pan, self.tilt = f"{prefix}pan", f"{prefix}tilt"
+        self.joints = {f"{prefix}pan": "pan_rad", f"{prefix}tilt": "tilt_rad"}
         self.rover, self.mast = f"{prefix}rover", f"{prefix}mast"
         self.pan_link, self.head = f"{prefix}pan_link", f"{prefix}head"
         self._prefix = prefix
@@ -54,10 +57,6 @@ class RosNames:
     def optical(self, camera: str) -> str:
         """Return the frame of a camera: x right, y down, z ahead."""
         return f"{self._prefix}{self.topic(camera)}_optical_frame"
-
-    def camera_of(self, frame: str, rig: Rig) -> str | None:
-        """Return the camera whose optical frame this is."""
-        return next((name for name in rig.cameras if self.optical(name) == frame), None)
 
 
 @dataclass(frozen=True)
@@ -134,6 +133,110 @@ class RosTime:
     def steady(self) -> bool:
         """Whether the offset is known and has not changed for the last `CALM` exchanges."""
         return self.exchange is not None and self._since_step >= CALM
+
+
+class NoTransform(Exception):
+    """Why a point of one frame has no place in another, in one sentence."""
+
+
+@dataclass
+class _Edge:
+    """The transforms of one child, (stamp, parent_from_child), oldest first; a static one has one."""
+
+    parent: str
+    static: bool
+    known: list[tuple[int, Rigid]] = field(default_factory=list)
+
+
+class TfTree:
+    """The newest seconds of each transform that was received; safe to use from any thread.
+
+    tf2 keeps the same, but comes with ROS only, in C++. Between two stamps the translation is linear and the
+    rotation about one axis.
+    """
+
+    def __init__(self) -> None:
+        self._edges: dict[str, _Edge] = {}
+        self._changed = threading.Condition()
+
+    def put(self, parent: str, child: str, at_ns: int, parent_from_child: Rigid, static: bool) -> None:
+        """Take a transform; one that is older than the newest takes its place among the others."""
+        with self._changed:
+            edge = self._edges.get(child)
+            if edge is None or (edge.parent, edge.static) != (parent, static):
+                edge = self._edges[child] = _Edge(parent, static)
+            known = edge.known
+            if static or (known and at_ns < known[-1][0] - KEPT_NS):  # or the clock was set back
+                known.clear()
+            if all(at_ns != one for one, _ in known):
+                insort(known, (at_ns, parent_from_child), key=lambda one: one[0])
+            del known[: bisect_left(known, known[-1][0] - KEPT_NS, key=lambda one: one[0])]
+            self._changed.notify_all()
+
+    def transform(self, target: str, source: str, at_ns: int, timeout_s: float = 0.0) -> Rigid:
+        """Return target_from_source at a time, 0 for the newest that all transforms between them know.
+
+        Waits up to ``timeout_s`` seconds of this machine for what is not known yet. Raises NoTransform: which
+        frame, or which time, is not known.
+        """
+        until_s = time.monotonic() + timeout_s
+        with self._changed:
+            while True:
+                try:
+                    return self._transform(target, source, at_ns)
+                except NoTransform:
+                    left_s = until_s - time.monotonic()
+                    if left_s <= 0.0:
+                        raise
+                    self._changed.wait(left_s)
+
+    def _transform(self, target: str, source: str, at_ns: int) -> Rigid:
+        up, down = self._to_root(source), self._to_root(target)
+        if up[-1] != down[-1]:
+            for frame in (source, target):
+                if frame not in self._edges and all(frame != edge.parent for edge in self._edges.values()):
+                    raise NoTransform(f"tf does not know the frame '{frame}'")
+            raise NoTransform(f"tf knows '{source}' and '{target}', but no way from one to the other")
+        while len(up) > 1 and len(down) > 1 and up[-2] == down[-2]:
+            up, down = up[:-1], down[:-1]
+        if not at_ns:
+            edges = [self._edges[child] for child in (*up[:-1], *down[:-1])]
+            at_ns = min((edge.known[-1][0] for edge in edges if not edge.static), default=0)
+        return self._along(down, at_ns).inverse @ self._along(up, at_ns)
+
+    def _to_root(self, frame: str) -> list[str]:
+        """A frame, its parent, and so on to the root."""
+        frames = [frame]
+        while (edge := self._edges.get(frames[-1])) is not None:
+            if len(frames) > MOST_FRAMES:
+                raise NoTransform(f"the frames of tf above '{frame}' go in a circle")
+            frames.append(edge.parent)
+        return frames
+
+    def _along(self, frames: list[str], at_ns: int) -> Rigid:
+        """last_from_first of frames, each the parent of the one before."""
+        found = Rigid.identity()
+        for child in frames[:-1]:
+            found = self._at(child, at_ns) @ found
+        return found
+
+    def _at(self, child: str, at_ns: int) -> Rigid:
+        edge = self._edges[child]
+        if edge.static:
+            return edge.known[0][1]
+        stamps = [one for one, _ in edge.known]
+        at = bisect_left(stamps, at_ns)
+        if at < len(stamps) and stamps[at] == at_ns:
+            return edge.known[at][1]
+        if at == 0 or at == len(stamps):
+            off_s = (stamps[0] - at_ns if at == 0 else at_ns - stamps[-1]) / NS
+            side = "before the oldest" if at == 0 else "after the newest"
+            raise NoTransform(f"the stamp is {off_s:.3f} s {side} transform of '{child}' that is known")
+        (before_ns, before), (after_ns, after) = edge.known[at - 1], edge.known[at]
+        part = (at_ns - before_ns) / (after_ns - before_ns)
+        turn = Rotation.from_matrix(before.rotation.T @ after.rotation).as_rotvec()
+        moved = before.translation_m + part * (after.translation_m - before.translation_m)
+        return Rigid(before.rotation @ np.asarray(Rotation.from_rotvec(part * turn).as_matrix()), moved)
 
 
 class DaemonState:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,9 +18,8 @@ from calib.geometry.rigid import Rigid, rot_z
 from hil_tests.waiting import NET_S, until
 from mastctl.client import ClientError
 from mastctl.packaged import config_folder
-from mastctl.ros2.goals import Goal, RosSteering
-from mastctl.ros2.state import CALM, ClockExchange, DaemonState, RosTime
-from mastctl.ros2.tf_tree import NoTransform, TfTree
+from mastctl.ros2.goals import Goal, GoalOutcome, RosSteering
+from mastctl.ros2.state import CALM, ClockExchange, DaemonState, NoTransform, RosTime, TfTree
 
 NS = 1_000_000_000
 REAL_NS = 1_795_000_000 * NS
@@ -108,13 +108,12 @@ def test_what_tf_does_not_know_is_named(target: str, source: str, stamp_s: int, 
 
 
 class _Daemon:
-    """Stands for a daemon and its client: operations end when they are stopped or allowed to."""
+    """Stands for a daemon and its client: an operation runs until it is stopped."""
 
     def __init__(self) -> None:
         self.calls: list[str] = []
         self.lost = False
-        self._end = threading.Event()
-        self._state = "done"
+        self._state = "running"
 
     def __enter__(self) -> _Daemon:
         return self
@@ -130,56 +129,83 @@ class _Daemon:
 
     def point(self, **request: Any) -> str:
         self.calls.append(f"point {request['pan_rad']}")
-        self._end.clear()
-        self._state = "done"
+        self._state = "running"
         return "1"
 
-    def wait(self, operation: str, timeout_s: float) -> Any:
-        until(lambda: self._end.is_set() or self.lost, "the operation's end")
+    def operation(self, operation: str) -> Any:
         if self.lost:
-            raise ClientError("no_daemon", "gone")
+            raise ClientError("operation_unknown", "it is another daemon")
         return {"state": self._state, "error": None}
 
     def stop_operation(self, operation: str) -> None:
         self.calls.append(f"stop {operation}")
         self._state = "stopped"
-        self._end.set()
-
-    def arrive(self) -> None:
-        self._end.set()
 
 
-def begun(steering: RosSteering, pan_rad: float) -> Goal:
-    goal = Goal(f"pan {pan_rad}", lambda client: {"pan_rad": pan_rad})
-    steering.begin(goal)
-    return goal
+@pytest.fixture
+def daemon() -> _Daemon:
+    return _Daemon()
 
 
-def test_a_newer_goal_stops_the_one_before_and_the_end_stops_all() -> None:
-    daemon = _Daemon()
-    steering = RosSteering(lambda: daemon)  # type: ignore[arg-type, return-value]
-    first = begun(steering, 1.0)
+@pytest.fixture
+def steering(daemon: _Daemon) -> Iterator[RosSteering]:
+    made = RosSteering(lambda: daemon)  # type: ignore[arg-type, return-value]
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def begin(steering: RosSteering) -> Iterator[Callable[[float], Future[GoalOutcome]]]:
+    """Begins a goal in a thread of its own, as ROS does."""
+    with ThreadPoolExecutor() as pool:
+        yield lambda pan_rad: pool.submit(
+            steering.carry_out, Goal(f"pan {pan_rad}", lambda client: {"pan_rad": pan_rad})
+        )
+        steering.close()
+
+
+Begin = Callable[[float], "Future[GoalOutcome]"]
+
+
+def test_a_newer_goal_stops_the_one_before_and_the_end_stops_all(
+    daemon: _Daemon, steering: RosSteering, begin: Begin
+) -> None:
+    first = begin(1.0)
     until(lambda: "point 1.0" in daemon.calls, "the first begins")
-    second = begun(steering, 2.0)
+    second = begin(2.0)
     until(lambda: "point 2.0" in daemon.calls, "the second begins")
-    assert daemon.calls.index("stop 1") < daemon.calls.index("point 2.0")
+    assert daemon.calls.index("released") < daemon.calls.index("point 2.0")
     steering.close()
     assert daemon.calls[-2:] == ["stop 1", "released"]
-    assert [goal.outcome.result(NET_S).state for goal in (first, second)] == ["stopped", "stopped"]
+    assert [goal.result(NET_S).state for goal in (first, second)] == ["stopped", "stopped"]
+    assert begin(3.0).result(NET_S).state == "stopped" and "point 3.0" not in daemon.calls
 
 
-def test_a_withdrawn_goal_is_stopped_and_a_lost_daemon_too() -> None:
-    daemon = _Daemon()
-    steering = RosSteering(lambda: daemon)  # type: ignore[arg-type, return-value]
-    goal = begun(steering, 1.0)
+def test_of_goals_that_wait_only_the_newest_begins(daemon: _Daemon, begin: Begin) -> None:
+    first = begin(1.0)
+    until(lambda: "point 1.0" in daemon.calls, "the first begins")
+    daemon.stop_operation = lambda operation: None  # type: ignore[method-assign]  # it takes its time
+    second, third = begin(2.0), None
+    third = begin(3.0)
+    assert second.result(NET_S).state == "replaced"
+    daemon._state = "done"
+    until(lambda: "point 3.0" in daemon.calls, "the newest begins")
+    daemon._state = "done"
+    assert [one.result(NET_S).state for one in (first, third)] == ["done", "done"]
+    assert "point 2.0" not in daemon.calls
+
+
+def test_a_stopped_goal_is_stopped_and_a_lost_daemon_too(
+    daemon: _Daemon, steering: RosSteering, begin: Begin
+) -> None:
+    goal = begin(1.0)
     until(lambda: "point 1.0" in daemon.calls, "it begins")
-    steering.withdraw(goal)
-    assert goal.outcome.result(NET_S).state == "stopped"
+    steering.stop()
+    assert goal.result(NET_S).state == "stopped"
     assert daemon.calls[-2:] == ["stop 1", "released"]
-    goal = begun(steering, 2.0)
+    goal = begin(2.0)
     until(lambda: "point 2.0" in daemon.calls, "the next begins")
     daemon.lost = True
-    outcome = goal.outcome.result(NET_S)
-    assert (outcome.state, outcome.code) == ("failed", "no_daemon")
+    outcome = goal.result(NET_S)
+    assert (outcome.state, outcome.code) == ("failed", "operation_unknown")
     assert daemon.calls[-2:] == ["stop 1", "released"]
-    steering.close()
