@@ -220,7 +220,7 @@ class Actions:
                 fields.pointing_frame, (axis.x, axis.y, axis.z), self._names, self._state
             )
             point: dict[str, Any] = self._messages.point_of(fields.target, self._names, self._state)
-            return point | aim
+            return {**point, **aim}
 
         _end(goal, self._carried_out(POINT_HEAD, goal, request, lambda: None))
         return self._point_head.Result()
