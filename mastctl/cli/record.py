@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import argparse
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from mastctl.cli.daemon import queue_output
 from mastctl.cli.options import command, option
 from mastctl.cli.output import Answer, Shown, WrongUse, tables_of
 from mastctl.cli.service import LISTEN, serve_config
-
-if TYPE_CHECKING:
-    from mastctl.recorder.recorded import Recording
 
 RECORDING = option("FILE", "an MCAP file, or a folder of segments")
 
@@ -50,21 +47,21 @@ def _repair(args: argparse.Namespace) -> Answer:
     "record replay",
     RECORDING,
     option("--mast OTHER.yaml", "evaluate as if this mast file had been used"),
-    option("--report DIR", "where the what-if's page goes"),
     LISTEN,
     help="serve a recording, or evaluate its pointings again with another mast file",
     example="afternoon.mcap --mast other.yaml",
 )
 def _replay(args: argparse.Namespace) -> Answer | int:
+    from calib.files.mast_file import load_rig
     from mastctl.recorder.recorded import read_whole
+    from mastctl.recorder.what_if import what_if
 
     if args.mast is None:
-        if args.report is not None:
-            raise WrongUse("--report goes with --mast: a recording that is served has no report")
         return _served(args)
     if args.listen is not None:
         raise WrongUse("--listen goes without --mast: a what-if is evaluated, not served")
-    return _what_if(args, read_whole(args.file))
+    document = what_if(read_whole(args.file), load_rig(args.mast))
+    return Answer(document, _shown(document, args.mast.name))
 
 
 def _served(args: argparse.Namespace) -> int:
@@ -81,30 +78,24 @@ def _served(args: argparse.Namespace) -> int:
     return 0
 
 
-def _what_if(args: argparse.Namespace, recording: Recording) -> Answer:
-    """Evaluate a recording's pointings and hand-offs again."""
-    from calib.files.mast_file import load_rig
-    from mastctl.drift.handoffs import handoff_of
-    from mastctl.recorder.what_if import WhatIf, handoffs_with, pointings_with, seen_in, write_what_if
+def _shown(document: Mapping[str, Any], name: str) -> Iterator[Shown]:
+    """The pointings and hand-offs, and what they are together, with a mast file of this name."""
+    from mastctl.report.pages import x_y
 
-    mast = load_rig(args.mast)
-    frames = {name: frame.facts for name, frame in recording.frames.items()}
-    seen, others = seen_in(recording.operations, frames)
-    handoffs = [handoff_of(args.file, at, found) for at, found in enumerate(recording.handoffs, start=1)]
-    what_if = WhatIf(
-        recording, mast, pointings_with(mast.rig, seen), handoffs_with(mast.rig, handoffs), others
+    for title, keys in (("pointings", ("operation", "pointing")), ("handoffs", ("time", "camera"))):
+        rows = [
+            [*(str(one[key]) for key in keys), x_y(one["recorded_px"], 3),
+             one["error"] or x_y(one["would_be_px"], 3), x_y(one["sigma_px"], 3)]
+            for one in document[title]
+        ]  # fmt: skip
+        if rows:
+            yield Shown(title, (*keys, "recorded (px)", "would be (px)", "sigma (px)"), rows)
+    rows = [
+        [kind, str(one["number"]), x_y(one["recorded"], 3), x_y(one["would_be"], 3)]
+        for kind, one in document["rms_px"].items()
+    ]
+    headings = ("what", "number", "recorded rms x, y (px)", "would be rms x, y (px)")
+    others = document["not_worked_out"].items()
+    yield Shown(
+        f"with {name}", headings, rows, [f"operation {one} is not worked out: {why}" for one, why in others]
     )
-    page = None if args.report is None else write_what_if(what_if, args.report)
-    return Answer(what_if.as_json() | {"report": None if page is None else str(page)}, _shown(what_if, page))
-
-
-def _shown(what_if: Any, page: Path | None) -> Iterator[Shown]:
-    from mastctl.recorder import what_if as report
-
-    pointings, handoffs = report.pointing_table(what_if), report.handoff_table(what_if)
-    for title, table in (("pointings", pointings), ("hand-offs", handoffs)):
-        if table.rows:
-            yield Shown(title, table.headings, table.rows)
-    summary = report.summary_table(what_if)
-    notes = [*report.other_lines(what_if), *([f"report: {page}"] if page else [])]
-    yield Shown(f"with {what_if.mast.path.name}", summary.headings, summary.rows, notes)

@@ -3,19 +3,18 @@
 A pointing's record holds the pixels in which the pair saw the target, with the joint angles then; the angles
 that were commanded, and those that were reached; and the pixel in which the target was seen then. With
 another mast file, position and commanded angles come out differently; where the target would have been seen
-at those follows from where it was seen, since the way between the two angles is short and the same mast
-file's. What the servos left of the command is taken as it was. With the recording's own mast file the
-recorded residual comes out again.
+at those follows from where it was seen, since the path between the two angles is short and the same mast
+file's. The servos' error is that of the record. With the recording's own mast file the recorded residual
+comes out again.
 
 The reported sigma is that of another run's residual: of the matches, of the range from the pair's matches,
-and of what the servos leave, as scattered over the recording.
+and of the servos' error, as scattered over the recording.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,15 +28,20 @@ from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import triangulate
 from calib.matching.handoff import MatchedHandoff
 from mastctl.as_json import as_json
+from mastctl.drift.handoffs import handoff_of
 from mastctl.recorder.recorded import Recording
-from mastctl.report import pages, pictures
-from mastctl.report.pages import Table, x_y
-from mastctl.report.pictures import Figure
 
 STEP_PX = 0.01
 STEP_RAD = 1e-6
 LEAST_PX = 0.02
 """No match is known better than this, whatever it says."""
+
+WITHOUT_TARGET = {
+    "panorama": "it took a panorama, in which no target was chosen",
+    "position_m": "it pointed at a position, and no image shows which pixel that is",
+    "pan_rad": "it turned the head to angles, without a target",
+}
+"""Why the operation of a request with this key has nothing to evaluate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,46 +70,46 @@ class SeenAgain:
     measured_approach: Approach = UNKNOWN
 
     @property
-    def residual_px(self) -> FloatArray:
-        """(2,) as it was measured."""
-        return self.target_px - self.aim_px
-
-    @property
-    def left_rad(self) -> FloatArray:
-        """(2,) what the servos left of the command."""
+    def servo_rad(self) -> FloatArray:
+        """(2,) the servos' error: reached less commanded."""
         return np.subtract(self.measured_rad, self.commanded_rad)
 
 
-@dataclass(frozen=True, eq=False)
-class WouldBe:
-    """A pointing with another mast file.
+def what_if(recording: Recording, mast: StoredRig) -> dict[str, Any]:
+    """Return what another mast file would have made of a recording, as JSON.
 
-    ``commanded_rad`` and ``range_m`` as it would have had them; ``would_be_px`` and ``sigma_px``: the
-    residual that would have been left, and one sigma of it. None, and a sentence in ``error``, without one.
+    ``pointings`` and ``handoffs`` have each residual as recorded and as it would have been (None, and a
+    sentence in ``error``, without one), ``rms_px`` both of first and later pointings and of each camera
+    handed to, ``not_worked_out`` the reasons by operation. Raises BadRecording without a mast file, BadFile
+    for a hand-off that is none.
     """
-
-    operation: str
-    pointing: int
-    frame_id: str
-    recorded_px: FloatArray
-    recorded_commanded_rad: tuple[float, float]
-    commanded_rad: tuple[float, float] | None = None
-    range_m: float | None = None
-    would_be_px: FloatArray | None = None
-    sigma_px: FloatArray | None = None
-    error: str = ""
-
-
-@dataclass(frozen=True, eq=False)
-class HandedAgain:
-    """A hand-off to one camera: found less predicted pixel, as recorded and with another mast file."""
-
-    time: str
-    camera: str
-    recorded_px: FloatArray
-    would_be_px: FloatArray | None
-    sigma_px: FloatArray
-    error: str = ""
+    name, stored = recording.first_mast
+    seen, others = seen_in(recording.operations, {key: one.facts for key, one in recording.frames.items()})
+    handoffs = [handoff_of(recording.path, at, one) for at, one in enumerate(recording.handoffs, start=1)]
+    pointings, handed = pointings_with(mast.rig, seen), handoffs_with(mast.rig, handoffs)
+    kinds: dict[str, list[dict[str, Any]]] = {}
+    for one in pointings:
+        kinds.setdefault("first pointing" if one["pointing"] == 1 else "second pointing", []).append(one)
+    for one in handed:
+        kinds.setdefault(f"hand-off to {one['camera']}", []).append(one)
+    solved = {kind: [one for one in rows if one["would_be_px"]] for kind, rows in sorted(kinds.items())}
+    return {
+        "recording": str(recording.path),
+        "recorded_mast": {"name": name.name, "digest": stored.digest},
+        "mast": {"name": mast.path.name, "digest": mast.digest},
+        "rms_px": {
+            kind: {
+                "number": len(rows),
+                "recorded": rms([one["recorded_px"] for one in rows]),
+                "would_be": rms([one["would_be_px"] for one in rows]),
+            }
+            for kind, rows in solved.items()
+            if rows
+        },
+        "pointings": pointings,
+        "handoffs": handed,
+        "not_worked_out": others,
+    }
 
 
 def seen_in(
@@ -118,16 +122,18 @@ def seen_in(
     found: list[SeenAgain] = []
     others: dict[str, str] = {}
     for name, record in operations.items():
-        if "pixel" not in (record.get("request") or {}):
-            if set(record.get("request") or {}) & {"position_m", "pan_rad"}:
-                others[name] = "it had no image in which anything could be measured"
+        request = record.get("request") or {}
+        if "pixel" not in request:
+            if reason := next((WITHOUT_TARGET[key] for key in WITHOUT_TARGET if request.get(key)), ""):
+                others[name] = reason
             continue
         try:
-            found += _pointings(name, record, frames)
+            pointings = _pointings(name, record, frames)
         except (KeyError, TypeError, ValueError, IndexError) as error:
             others[name] = f"its record does not hold enough ({type(error).__name__}: {error})"
             continue
-        if not any(one.operation == name for one in found):
+        found += pointings
+        if not pointings:
             message = (record.get("error") or {}).get("message", "")
             others[name] = f"it {record.get('state', 'did not end')}: {message}".rstrip(": ")
     return found, others
@@ -141,30 +147,27 @@ def _pointings(name: str, record: Mapping[str, Any], frames: Mapping[str, Any]) 
     for step in record.get("steps") or []:
         if step["state"] == "done":
             steps[step["name"], int(step["detail"].get("pointing", 1))] = step["detail"]
-    pair_ids = steps["frames", 1]["frame_ids"] if results else []
-    rest = steps["rest", 1] if results else {}
     found: list[SeenAgain] = []
     for number, result in enumerate(results, start=1):
         if result.get("target_px") is None:
             continue
-        aim_camera = str(result["camera"])
         if number == 1:
-            pair = clicked, _camera_of(pair_ids[1])
+            ids, rest = steps["frames", 1]["frame_ids"], steps["rest", 1]
+            pair = clicked, str(ids[1]).rsplit("-", 3)[0]  # the camera, before count, mast file and run
             pixels = [steps["target", 1]["pixel_px"], steps["stereo", 1]["pixel_px"]]
             sigmas = [steps["target", 1]["sigma_px"], steps["stereo", 1]["sigma_px"]]
-            pair_facts, otherwise = frames.get(pair_ids[0]), (rest["pan_rad"], rest["tilt_rad"])
+            pair_facts, otherwise = frames.get(ids[0]), (rest["pan_rad"], rest["tilt_rad"])
         else:
             before, pair_step = steps["measure", number - 1], steps["eyes", number - 1]
             if len(pair_step["confirmed_by"]) != 1:
                 continue  # another pair gave the range; the record of the first pointing says enough
-            pair = aim_camera, str(pair_step["confirmed_by"][0])
+            pair = str(result["camera"]), str(pair_step["confirmed_by"][0])
             pixels = [before["pixel_px"], pair_step[pair[1]]["pixel_px"]]
             sigmas = [before["sigma_px"], before["sigma_px"]]
             last = results[number - 2]
             pair_facts = frames.get(steps["look", number - 1]["frame_ids"][0])
             otherwise = last["measured_pan_rad"], last["measured_tilt_rad"]
         where, pair_approach = _joints(pair_facts, otherwise)
-        facts = frames.get(result["frame_id"])
         found.append(
             SeenAgain(
                 operation=name,
@@ -173,7 +176,7 @@ def _pointings(name: str, record: Mapping[str, Any], frames: Mapping[str, Any]) 
                 pair_px=np.array(pixels, dtype=float),
                 pair_sigma_px=np.maximum(np.array(sigmas, dtype=float), LEAST_PX),
                 pair_rad=where,
-                aim_camera=aim_camera,
+                aim_camera=str(result["camera"]),
                 aim_px=np.array(result["aim_px"], dtype=float),
                 commanded_rad=(float(result["commanded_pan_rad"]), float(result["commanded_tilt_rad"])),
                 measured_rad=(float(result["measured_pan_rad"]), float(result["measured_tilt_rad"])),
@@ -181,37 +184,56 @@ def _pointings(name: str, record: Mapping[str, Any], frames: Mapping[str, Any]) 
                 target_sigma_px=np.maximum(np.array(result["residual_sigma_px"], dtype=float), LEAST_PX),
                 frame_id=str(result["frame_id"]),
                 pair_approach=pair_approach,
-                measured_approach=_joints(facts, (0.0, 0.0))[1],
+                measured_approach=_joints(frames.get(result["frame_id"]), (0.0, 0.0))[1],
             )
         )
     return found
 
 
-def pointings_with(rig: Rig, seen: Sequence[SeenAgain]) -> list[WouldBe]:
-    """Return each pointing as it would have been with another mast file."""
-    servo_rad = _servo_scatter(seen)
-    return [_would_be(rig, one, servo_rad) for one in seen]
+def _joints(facts: Any, otherwise: tuple[float, float]) -> tuple[tuple[float, float], Approach]:
+    """Joint angles of a recorded frame as read, or those of the step before it, and from which side."""
+    if facts is None:
+        return (float(otherwise[0]), float(otherwise[1])), UNKNOWN
+    approach = float(facts.get("pan_approach", 0.0)), float(facts.get("tilt_approach", 0.0))
+    return (float(facts["pan_rad"]), float(facts["tilt_rad"])), approach
 
 
-def _would_be(rig: Rig, seen: SeenAgain, servo_rad: FloatArray) -> WouldBe:
-    """One pointing with another mast file."""
-    one = WouldBe(seen.operation, seen.pointing, seen.frame_id, seen.residual_px, seen.commanded_rad)
-    missing = [name for name in (*seen.pair, seen.aim_camera) if name not in rig.cameras]
-    if missing:
-        return replace(one, error=f"the mast file has no camera {missing[0]}")
-    try:
-        commanded, range_m, residual = _residual(rig, seen, seen.pair_px, seen.left_rad)
-        sigma = _sigma(rig, seen, residual, servo_rad)
-    except CalibError as error:
-        return replace(one, error=" ".join(str(error).split()))
-    return replace(one, commanded_rad=commanded, range_m=range_m, would_be_px=residual, sigma_px=sigma)
+def pointings_with(rig: Rig, seen: Sequence[SeenAgain]) -> list[dict[str, Any]]:
+    """Return each pointing as it would have been with another mast file, as JSON."""
+    servo_rad = np.sqrt(np.mean(np.square([one.servo_rad for one in seen]), axis=0)) if seen else np.zeros(2)
+    found = []
+    for one in seen:
+        row: dict[str, Any] = {
+            "operation": one.operation,
+            "pointing": one.pointing,
+            "frame_id": one.frame_id,
+            "recorded_px": one.target_px - one.aim_px,
+            "recorded_commanded_rad": one.commanded_rad,
+            "commanded_rad": None,
+            "range_m": None,
+            "would_be_px": None,
+            "sigma_px": None,
+            "error": "",
+        }
+        missing = [name for name in (*one.pair, one.aim_camera) if name not in rig.cameras]
+        try:
+            if missing:
+                raise CalibError(f"the mast file has no camera {missing[0]}")
+            commanded, range_m, residual = _residual(rig, one, one.pair_px, one.servo_rad)
+            sigma = _sigma(rig, one, residual, servo_rad)
+            row |= {"commanded_rad": commanded, "range_m": range_m}
+            row |= {"would_be_px": residual, "sigma_px": sigma}
+        except CalibError as error:
+            row["error"] = " ".join(str(error).split())
+        found.append(as_json(row))
+    return found
 
 
 def _residual(
-    rig: Rig, seen: SeenAgain, pair_px: FloatArray, left_rad: FloatArray
+    rig: Rig, seen: SeenAgain, pair_px: FloatArray, servo_rad: FloatArray
 ) -> tuple[tuple[float, float], float, FloatArray]:
     """Commanded angles, range and residual of a pointing with a mast file, of the pair's pixels (2, 2) and
-    what the servos leave (2,). Raises CalibError.
+    the servos' error (2,). Raises CalibError.
     """
     joints, came = rig.joints, seen.measured_approach
     at = joints.true_rad(seen.pair_rad, seen.pair_approach)
@@ -225,7 +247,7 @@ def _residual(
     range_m = float(np.linalg.norm(target - ray.origins_m))
     position_m = ray.origins_m + range_m * ray.directions
     commanded = joints.read_rad((chosen.pan_rad, chosen.tilt_rad), came)
-    reached = commanded[0] + float(left_rad[0]), commanded[1] + float(left_rad[1])
+    reached = commanded[0] + float(servo_rad[0]), commanded[1] + float(servo_rad[1])
     camera = rig.camera_in_rover(seen.aim_camera, *joints.true_rad(reached, came))
     pixel, _ = camera.project(position_m)
     return commanded, range_m, np.asarray(pixel - seen.aim_px, dtype=float)
@@ -233,8 +255,8 @@ def _residual(
 
 def _sigma(rig: Rig, seen: SeenAgain, residual_px: FloatArray, servo_rad: FloatArray) -> FloatArray:
     """(2,) one sigma of another run's residual, by what each measured number moves it."""
-    measured = np.concatenate([seen.pair_px.ravel(), seen.left_rad])
-    # What the servos leave differs in this run and in the other one.
+    measured = np.concatenate([seen.pair_px.ravel(), seen.servo_rad])
+    # The servos' error differs in this run and in the other one.
     sigmas = np.concatenate([seen.pair_sigma_px.ravel(), np.sqrt(2.0) * servo_rad])
     variance = np.square(seen.target_sigma_px)
     for at, (sigma, step) in enumerate(zip(sigmas, [STEP_PX] * 4 + [STEP_RAD] * 2, strict=True)):
@@ -245,177 +267,34 @@ def _sigma(rig: Rig, seen: SeenAgain, residual_px: FloatArray, servo_rad: FloatA
     return np.sqrt(variance)
 
 
-def _servo_scatter(seen: Sequence[SeenAgain]) -> FloatArray:
-    """(2,) rms of what the servos left of their commands, radians."""
-    left = np.array([one.left_rad for one in seen]).reshape(-1, 2)
-    return np.sqrt(np.mean(np.square(left), axis=0)) if len(left) else np.zeros(2)
-
-
-def handoffs_with(rig: Rig, handoffs: Sequence[MatchedHandoff]) -> list[HandedAgain]:
-    """Return each hand-off that was found, as it would have been predicted with another mast file."""
-    rows: list[HandedAgain] = []
+def handoffs_with(rig: Rig, handoffs: Sequence[MatchedHandoff]) -> list[dict[str, Any]]:
+    """Return, as JSON, each camera's found less predicted pixel as recorded and with another mast file."""
+    rows = []
     for one in handoffs:
         for camera, landed in one.found.items():
             assert landed.found_px is not None and landed.found_covariance_px2 is not None
-            sigma = np.sqrt(np.diag(landed.found_covariance_px2 + landed.geometric_covariance_px2))
-            row = HandedAgain(one.time, camera, landed.found_px - landed.geometric_px, None, sigma)
+            row: dict[str, Any] = {
+                "time": one.time,
+                "camera": camera,
+                "recorded_px": landed.found_px - landed.geometric_px,
+                "would_be_px": None,
+                "sigma_px": np.sqrt(np.diag(landed.found_covariance_px2 + landed.geometric_covariance_px2)),
+                "error": "",
+            }
             try:
                 again = hand_off(
                     rig, one.pair, [camera], one.joints, *one.clicks_px,
                     to_joints=one.to_joints, sigma_px=one.sigma_px,
                 ).pixels[camera]  # fmt: skip
+                assert again is not None
+                row["would_be_px"] = landed.found_px - again.pixel_px
             except (CalibError, KeyError) as error:
-                rows.append(replace(row, error=" ".join(str(error).split()) or "no such camera"))
-                continue
-            assert again is not None
-            rows.append(replace(row, would_be_px=landed.found_px - again.pixel_px))
+                row["error"] = " ".join(str(error).split()) or "no such camera"
+            rows.append(as_json(row))
     return rows
 
 
-def rms(rows: Sequence[FloatArray]) -> tuple[float, float] | None:
-    """Return the root mean square of columns, None of nothing."""
-    if not rows:
-        return None
+def rms(rows: Sequence[Sequence[float]]) -> tuple[float, float]:
+    """Return the root mean square of each column."""
     x, y = np.sqrt(np.mean(np.square(np.array(rows)), axis=0))
     return float(x), float(y)
-
-
-def _camera_of(frame_id: str) -> str:
-    """The camera in a frame's id: the part before its count, mast file and run."""
-    return frame_id.rsplit("-", 3)[0]
-
-
-def _joints(facts: Any, otherwise: tuple[float, float]) -> tuple[tuple[float, float], Approach]:
-    """Joint angles of a recorded frame as read, or those of the step before it, and from which side."""
-    if facts is None:
-        return (float(otherwise[0]), float(otherwise[1])), UNKNOWN
-    approach = float(facts.get("pan_approach", 0.0)), float(facts.get("tilt_approach", 0.0))
-    return (float(facts["pan_rad"]), float(facts["tilt_rad"])), approach
-
-
-@dataclass(frozen=True, eq=False)
-class WhatIf:
-    """A recording, the other mast file, and what came out."""
-
-    recording: Recording
-    mast: StoredRig
-    pointings: Sequence[WouldBe]
-    handoffs: Sequence[HandedAgain]
-    others: Mapping[str, str]
-
-    def as_json(self) -> dict[str, Any]:
-        """Return everything for programs."""
-        name, stored = self.recording.first_mast
-        return {
-            "recording": str(self.recording.path),
-            "recorded_mast": {"name": name.name, "digest": stored.digest},
-            "mast": {"name": self.mast.path.name, "digest": self.mast.digest},
-            "rms_px": {
-                key: {"recorded": rms(was), "would_be": rms(would)} for key, was, would in self.columns()
-            },
-            "pointings": as_json(self.pointings),
-            "handoffs": as_json(self.handoffs),
-            "not_worked_out": dict(self.others),
-        }
-
-    def columns(self) -> list[tuple[str, list[FloatArray], list[FloatArray]]]:
-        """Return, for first and later pointings and for each camera handed to: its name, residuals as they
-        were recorded, and as they would have been.
-        """
-        rows: list[tuple[str, WouldBe | HandedAgain]] = [
-            ("first pointing" if one.pointing == 1 else "second pointing", one) for one in self.pointings
-        ]
-        found: dict[str, tuple[list[FloatArray], list[FloatArray]]] = {}
-        for key, row in [*rows, *((f"hand-off to {one.camera}", one) for one in self.handoffs)]:
-            if row.would_be_px is not None:
-                was, would = found.setdefault(key, ([], []))
-                was.append(row.recorded_px)
-                would.append(row.would_be_px)
-        return [(key, *both) for key, both in sorted(found.items())]
-
-
-def summary_table(what_if: WhatIf) -> Table:
-    """Return the rms before and after, a row a kind."""
-    headings = ("what", "number", "recorded rms x, y (px)", "would be rms x, y (px)")
-    rows = [
-        [key, str(len(was)), x_y(rms(was), 3), x_y(rms(would), 3)] for key, was, would in what_if.columns()
-    ]
-    return Table(headings, rows)
-
-
-def pointing_table(what_if: WhatIf) -> Table:
-    """Return each pointing."""
-    rows = [
-        [
-            one.operation, str(one.pointing), x_y(one.recorded_px, 3), x_y(one.would_be_px, 3) or one.error,
-            x_y(one.sigma_px, 3),
-        ]
-        for one in what_if.pointings
-    ]  # fmt: skip
-    return Table(("operation", "pointing", "recorded (px)", "would be (px)", "sigma (px)"), rows)
-
-
-def handoff_table(what_if: WhatIf) -> Table:
-    """Return each hand-off."""
-    headings = ("hand-off", "to", "recorded x, y (px)", "would be x, y (px)", "sigma x, y (px)")
-    rows = [
-        [one.time, one.camera, x_y(one.recorded_px), x_y(one.would_be_px) or one.error, x_y(one.sigma_px)]
-        for one in what_if.handoffs
-    ]
-    return Table(headings, rows)
-
-
-def other_lines(what_if: WhatIf) -> list[str]:
-    """Return why some operations were not worked out."""
-    return [f"operation {name} is not worked out: {why}" for name, why in what_if.others.items()]
-
-
-def write_what_if(what_if: WhatIf, folder: Path) -> Path:
-    """Write the page ``what_if.html`` into a folder, which is made if need be; return it. Raises OSError."""
-    folder.mkdir(parents=True, exist_ok=True)
-    name, stored = what_if.recording.first_mast
-    summary = what_if.recording.summary()
-    hardware = what_if.recording.facts.get("hardware", "unknown")
-    facts = [
-        (
-            "recording",
-            f"{what_if.recording.path.name}, {summary['seconds']:.0f} s, {summary['frames']} images",
-        ),
-        ("recorded with", f"{name.name} ({stored.digest[:12]})"),
-        ("what if", f"{what_if.mast.path.name} ({what_if.mast.digest[:12]})"),
-    ]
-    html = pages.page(
-        "what_if.html",
-        title=f"What if: {what_if.mast.path.name}",
-        badge=pages.Badge(hardware.upper(), hardware),
-        facts=facts,
-        summary=summary_table(what_if),
-        pointings=pointing_table(what_if),
-        handoffs=handoff_table(what_if),
-        plot=_plot(what_if) if what_if.columns() and pictures.can_plot() else None,
-        answered=bool(what_if.columns()),
-        others=other_lines(what_if),
-    )
-    page = folder / "what_if.html"
-    page.write_text(html, encoding="utf-8", errors="backslashreplace")
-    return page
-
-
-def _plot(what_if: WhatIf) -> Figure:
-    """Residuals as recorded and as they would have been, an arrow from the one to the other."""
-    columns = what_if.columns()
-    figure = pictures.new_plot(min(4.2 * len(columns), 13.0), 4.0)
-    axes = figure.subplots(1, len(columns), squeeze=False)[0]
-    for axis, (key, was, would) in zip(axes, columns, strict=True):
-        before, after = np.array(was), np.array(would)
-        for one, other in zip(before, after, strict=True):
-            axis.annotate("", other, one, arrowprops={"arrowstyle": "-", "color": "0.7", "lw": 0.8})
-        axis.plot(*before.T, "x", color=pictures.RUST, ms=6, label="recorded")
-        axis.plot(*after.T, "o", color=pictures.BLUE, ms=5, mfc="none", label="would be")
-        most = 1.15 * max(0.1, float(np.abs(np.concatenate([before, after])).max()))
-        axis.axhline(0.0, color="0.6", lw=0.6)
-        axis.axvline(0.0, color="0.6", lw=0.6)
-        axis.set(title=key, xlabel="x, px", ylabel="y, px (down)", xlim=(-most, most), ylim=(most, -most))
-        axis.set_aspect("equal")
-        axis.legend(fontsize=8, loc="upper right")
-    return pictures.plot(figure, "residuals as recorded and as they would have been")

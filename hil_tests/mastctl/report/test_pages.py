@@ -75,12 +75,7 @@ def test_a_name_that_nobody_gave_is_refused_rather_than_left_empty() -> None:
 
 
 def test_a_report_has_one_main_part_and_no_empty_heading() -> None:
-    table = Table(["", "x px"], [["navcam left", "0.1"]])
-    told = {"title": "Run", "badge": pages.Badge("REAL", "real"), "facts": [("mast file", "a.yaml")]}
-    text = pages.page(
-        "what_if.html", **told, answered=True, summary=table, plot=None, pointings=Table([], []),
-        handoffs=Table([], []), others=[],
-    )  # fmt: skip
+    text = study(failures=Table(["", "x px"], [["navcam left", "0.1"]]))
     assert text.count("<main>") == text.count("</main>") == 1
     assert not re.search(r"<th[^>]*>\s*</th>", text)
     assert '<th scope="col" class="number">x px</th>' in text
