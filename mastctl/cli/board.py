@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -110,9 +111,7 @@ def _find(args: argparse.Namespace) -> Answer:
             raise WrongUse(f"{name} is no picture that can be read: {reason}") from None
         if image.dtype not in (np.uint8, np.uint16):
             raise WrongUse(f"{name} has {image.dtype} where 8 or 16 bits a pixel are expected")
-        corners = find_corners(
-            board, image.astype(np.uint8) if image.dtype == np.uint8 else image.astype(np.uint16)
-        )
+        corners = find_corners(board, image)
         if isinstance(corners, CornersNotFound):
             found.append({"picture": name, "corners": 0, "of": len(board.ids), "reason": corners.reason})
             continue
@@ -131,18 +130,15 @@ def _paper_mm(args: argparse.Namespace) -> tuple[float, float]:
     from mastctl.setup.board_sheet import PAPERS_MM
 
     known = {name.lower(): size for name, size in PAPERS_MM.items()}
-    size = known.get(args.paper.lower())
-    if size is None:
-        width, by, height = args.paper.lower().removesuffix("mm").removesuffix("_").partition("x")
-        try:
-            size = float(width), float(height)
-        except ValueError:
-            size = 0.0, 0.0
-        if not by or not all(60.0 <= side <= 3000.0 for side in size):
-            raise WrongUse(
-                f"--paper: '{args.paper}' where one of {', '.join(PAPERS_MM)}, or WxH in mm from 60 to 3000, "
-                "as 500x700, is expected"
-            )
+    sides = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)(?:_?mm)?", args.paper.lower(), re.ASCII)
+    size = known.get(args.paper.lower()) or (0.0, 0.0)
+    if sides is not None:
+        size = float(sides[1]), float(sides[2])
+    if not all(60.0 <= side <= 3000.0 for side in size):
+        raise WrongUse(
+            f"--paper: '{args.paper}' where one of {', '.join(PAPERS_MM)}, or WxH in mm from 60 to 3000, "
+            "as 500x700, is expected"
+        )
     return (max(size), min(size)) if args.landscape else size
 
 
@@ -152,49 +148,42 @@ def _board(args: argparse.Namespace, paper_mm: tuple[float, float]) -> AnyBoard:
     from calib.targets.board_file import board_of, dictionary_size
     from mastctl.setup.board_sheet import largest_mm
 
+    for name in sorted({name for names in OPTIONS_OF.values() for name in names}):
+        if getattr(args, name) is not None and name not in OPTIONS_OF[args.kind]:
+            known = ", ".join(f"--{one.replace('_', '-')}" for one in OPTIONS_OF[args.kind])
+            given = f"--{name.replace('_', '-')}"
+            raise WrongUse(f"{given} is not for a board of kind {args.kind}; its options are {known}")
     wide_mm, high_mm = largest_mm(paper_mm)
     usual_mm = USUAL_MM * min(wide_mm, high_mm) / 174.0
     usual_mm = max(1.0, float(round(usual_mm / 5.0) * 5.0 if usual_mm > 10 else round(usual_mm)))
-    document: dict[str, Any] = {"kind": args.kind}
-    _refuse_others(args)
+    # What one more column takes; what the first and the last need beside that; the sizes in the file.
     if args.kind in ("charuco", "checkerboard"):
-        step = args.square_mm or usual_mm
-        columns, rows = args.columns or int(wide_mm / step), args.rows or int(high_mm / step)
-        document["square_m"] = step / 1000
+        step, edge = args.square_mm or usual_mm, 0.0
+        sizes = {"square_m": step}
         if args.kind == "charuco":
-            document["marker_m"] = (args.marker_mm or 0.75 * step) / 1000
-            enough = (name for name in DICTIONARIES if dictionary_size(name) >= columns * rows // 2)
-            document["dictionary"] = args.dictionary or next(enough, DICTIONARIES[-1])
+            sizes["marker_m"] = args.marker_mm or 0.75 * step
     elif args.kind == "aprilgrid":
         tag = args.tag_mm or round(1.1 * usual_mm)
-        gap = args.gap_mm or 0.3 * tag
-        columns = args.columns or int((wide_mm - gap) / (tag + gap))
-        rows = args.rows or int((high_mm - gap) / (tag + gap))
-        document |= {"tag_m": tag / 1000, "gap_m": round(gap / 1000, 6), "family": args.family or "tag36h11"}
+        edge = args.gap_mm or 0.3 * tag
+        step, sizes = tag + edge, {"tag_m": tag, "gap_m": edge}
     else:
         step = args.spacing_mm or round(0.8 * usual_mm)
         dot = args.dot_mm or 0.5 * step
-        columns = args.columns or int((wide_mm - dot) / step) + 1
-        rows = args.rows or int((high_mm - dot) / step) + 1
-        document |= {"spacing_m": step / 1000, "dot_diameter_m": dot / 1000}
-    document |= {"columns": columns, "rows": rows}
+        edge, sizes = dot - step, {"spacing_m": step, "dot_diameter_m": dot}
+    columns, rows = args.columns or int((wide_mm - edge) / step), args.rows or int((high_mm - edge) / step)
+    document: dict[str, Any] = {"kind": args.kind, "columns": columns, "rows": rows}
+    document |= {key: round(size_mm / 1000, 6) for key, size_mm in sizes.items()}
+    if args.kind == "charuco":
+        enough = (name for name in DICTIONARIES if dictionary_size(name) >= columns * rows // 2)
+        document["dictionary"] = args.dictionary or next(enough, DICTIONARIES[-1])
+    elif args.kind == "aprilgrid":
+        document["family"] = args.family or "tag36h11"
     if args.first_id is not None:
         document["first_id"] = args.first_id
     try:
         return board_of(args.out, "", document)
     except BadFile as error:
         raise WrongUse(f"the board's {error.place}: {error.reason}") from None
-
-
-def _refuse_others(args: argparse.Namespace) -> None:
-    """Refuse options of another kind of board."""
-    for name in sorted({name for names in OPTIONS_OF.values() for name in names}):
-        value, given = getattr(args, name), f"--{name.replace('_', '-')}"
-        if value is not None and name not in OPTIONS_OF[args.kind]:
-            known = ", ".join(f"--{one.replace('_', '-')}" for one in OPTIONS_OF[args.kind])
-            raise WrongUse(f"{given} is not for a board of kind {args.kind}; its options are {known}")
-        if name.endswith("_mm") and value is not None and not 0.0 < value <= 1000.0:
-            raise WrongUse(f"{given}: {value:g} where more than 0 and at most 1000 is expected")
 
 
 def _check_free(yaml: Path) -> None:
@@ -217,14 +206,9 @@ def _written(yaml: Path, files: list[Path], bar_m: tuple[float, float]) -> Answe
 
     board = load_board(yaml)
     document = {
-        "board": document_of(board),
-        "files": [str(one) for one in files],
-        "bar_m": {"across": bar_m[0], "down": bar_m[1]},
-        "size_m": list(board.size_m),
-    }
+        "board": document_of(board), "files": [str(one) for one in files],
+        "bar_m": {"across": bar_m[0], "down": bar_m[1]}, "size_m": list(board.size_m),
+    }  # fmt: skip
     width_mm, height_mm = (1000 * size for size in board.size_m)
-    lines = [
-        f"{description(board)}; {width_mm:.1f} x {height_mm:.1f} mm",
-        *(f"written: {one}" for one in files),
-    ]
-    return Answer(document, lines)
+    lines = (f"written: {one}" for one in files)
+    return Answer(document, [f"{description(board)}; {width_mm:.1f} x {height_mm:.1f} mm", *lines])

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
-import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from mastctl import signals
 from mastctl.cli.options import command, option, positive_number
-from mastctl.cli.output import Answer, Shown, WrongUse, check_file, chosen, tables_of, tell
+from mastctl.cli.output import Answer, Shown, WrongUse, check_file, tables_at, tables_of, tell
 
 if TYPE_CHECKING:
     from drivers.hardware import HardwareSettings
@@ -189,8 +186,8 @@ def camera_sync(args: argparse.Namespace) -> Answer:
     plan = plan_sweep(rig, names, config.limits, args.amplitude, args.speed, args.seconds)
     settings, clock = with_cameras(config, names), SystemClock()
     opened = devices_beside(settings, bounds, clock, moves=True, own_cameras=True)
-    with _ending_signals() as stop, opened as (devices, cameras):
-        sweep = Sweep(devices, cameras, rig, config.limits, stop, clock)
+    with opened as (devices, cameras):
+        sweep = Sweep(devices, cameras, rig, config.limits, clock)
         if not args.json:
             tell(
                 f"turning pan {plan.amplitude_rad:.3f} rad to either side for {plan.seconds:g} s, "
@@ -198,35 +195,17 @@ def camera_sync(args: argparse.Namespace) -> Answer:
             )
         sweep.run(plan)
     found = {name: sweep.found(name, settings.cameras[name].offset_s) for name in names}
+    measured = {name: one for name, one in found.items() if one["offset_s"] is not None}
     notes = [one["warning"] for one in found.values() if one["warning"]]
     if len(notes) == len(found) > 1:
         notes.append("where all are off by the same, the head's readings may as well be stamped wrong")
     notes += [f"{name}: {one['failure']}" for name, one in found.items() if one["failure"]]
-    measured = {name: one for name, one in found.items() if one["offset_s"] is not None}
-    lines = [
-        f"for the configuration: cameras.{name}.offset_s: {one['offset_s']:.5f}"
-        for name, one in measured.items()
-    ]
-    keys = "left_s sigma_s frames rolling_s play_rad"
-    rows = [{"camera": name, **chosen(one, keys)} for name, one in measured.items()]
-    tables = tables_of({"left_s: pictures later than their stamps": rows}, "camera sync") if rows else []
+    lines = [f"cameras.{name}.offset_s: {one['offset_s']:.5f}" for name, one in measured.items()]
     document = {"cameras": found, "sweep": vars(plan), "notes": notes}
-    return Answer(document, [*tables, *lines, *notes], 0 if measured else 1)
-
-
-@contextmanager
-def _ending_signals() -> Iterator[threading.Event]:
-    """An event that every ending signal sets, so that the head is stopped before the program ends."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-    before = {number: signal.signal(number, lambda *ignored: stop.set()) for number in signals.wanted()}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    keys = " ".join(f"cameras.*.{key}" for key in ("left_s", "sigma_s", "frames", "rolling_s", "play_rad"))
+    tables = tables_at(document, keys, "left_s: pictures later than their stamps") if measured else []
+    heading = ["for the configuration:"] if lines else []
+    return Answer(document, [*tables, *heading, *lines, *notes], 0 if measured else 1)
 
 
 @contextmanager
@@ -235,6 +214,7 @@ def opened_camera(args: argparse.Namespace) -> Iterator[tuple[Camera, tuple[int,
 
     A simulated camera is on a simulated head, which is opened before it and not moved.
     """
+    from drivers.clock import SystemClock
     from drivers.hardware import DeviceSettings, HardwareSettings, is_hardware
     from drivers.registry import drivers_of
     from mastctl.config import load_config
@@ -254,9 +234,8 @@ def opened_camera(args: argparse.Namespace) -> Iterator[tuple[Camera, tuple[int,
         ) as one:
             yield one, None
         return
-    for name in ("format", "size", "rate", "set"):
-        if getattr(args, name):
-            raise WrongUse(f"--{name} does not go with --config, which has it")
+    if any(getattr(args, name) for name in ("format", "size", "rate", "set")):
+        raise WrongUse("--format, --size, --rate and --set do not go with --config, which has them")
     config = load_config(args.config)
     if args.camera not in config.hardware.cameras:
         known = ", ".join(config.hardware.cameras)
@@ -264,14 +243,12 @@ def opened_camera(args: argparse.Namespace) -> Iterator[tuple[Camera, tuple[int,
     settings, bounds = with_cameras(config, [args.camera]), bounds_of(config)
     assert bounds.stored is not None
     size_px = bounds.stored.rig.cameras[args.camera].model.size_px
-    if is_hardware("simulated", "camera", settings.cameras[args.camera].driver):
-        from drivers.clock import SystemClock
-
-        with devices_beside(settings, bounds, SystemClock(), moves=False, own_cameras=True) as (_, cameras):
-            yield cameras[args.camera], size_px
-    else:
+    if not is_hardware("simulated", "camera", settings.cameras[args.camera].driver):
         with open_one_camera(settings, args.camera) as camera:
             yield camera, size_px
+        return
+    with devices_beside(settings, bounds, SystemClock(), moves=False, own_cameras=True) as (_, cameras):
+        yield cameras[args.camera], size_px
 
 
 def with_cameras(config: Config, names: Iterable[str]) -> HardwareSettings:

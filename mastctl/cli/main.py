@@ -8,7 +8,6 @@ slow (numpy, cv2, numba, fastapi) inside its functions.
 
 from __future__ import annotations
 
-import argparse
 import atexit
 import contextlib
 import importlib
@@ -93,19 +92,6 @@ class _Overview(Parser):
         return "\n".join(lines)
 
 
-class _Version(argparse.Action):
-    """Print the installed version, which is slow to read."""
-
-    def __init__(self, option_strings: Sequence[str], dest: str, **settings: Any) -> None:
-        super().__init__(option_strings, dest, nargs=0, default=argparse.SUPPRESS, help="print the version")
-
-    def __call__(self, parser: argparse.ArgumentParser, *ignored: Any) -> NoReturn:
-        from importlib.metadata import version
-
-        sys.stdout.write(f"mastctl {version('mastctl')}\n")
-        parser.exit()
-
-
 def build_parser(wanted: str | None = None) -> Parser:
     """Return the parser of all commands, or of those whose first word is ``wanted``."""
     chosen = {name: entry for name, entry in COMMANDS.items() if wanted in (None, name)}
@@ -113,7 +99,7 @@ def build_parser(wanted: str | None = None) -> Parser:
         for module in modules.split():
             importlib.import_module(f"mastctl.cli.{module}")
     parser = _Overview(prog="mastctl", usage="mastctl [-h] [--version] COMMAND ...")
-    parser.add_argument("--version", action=_Version)
+    parser.add_argument("--version", action="store_true", help="print the version")
     inner = {"": parser.add_subparsers(parser_class=Parser, prog="mastctl", metavar="COMMAND", required=True)}
     for name in chosen:
         if name not in DECLARED:
@@ -223,6 +209,11 @@ def _give_up_stdout() -> None:
 def _run(argv: Sequence[str]) -> int:
     """Parse and run; --help and --version end here with their own code."""
     try:
+        if argv[:1] == ["--version"]:
+            from importlib.metadata import version  # slow to load
+
+            sys.stdout.write(f"mastctl {version('mastctl')}\n")
+            return 0
         if argv and argv[0].startswith("--print-completion"):
             parser = _completing()
         else:
@@ -255,17 +246,10 @@ def _joined(argv: Sequence[str]) -> tuple[list[str], str]:
     if command not in COMMANDS:
         near = get_close_matches(command, COMMANDS, n=1)
         hint = f"did you mean '{near[0]}'?" if near else f"known are {', '.join(COMMANDS)}"
-        raise output.WrongUse(f"no command '{command}'; {_moved(command) or hint}")
+        raise output.WrongUse(f"no command '{command}'; {hint}")
     if rest and f"{command} {rest[0]}" in COMMANDS:  # a folder of that name is ``./bench``
         command = f"{command} {rest.pop(0)}"
     return [command, *rest], command
-
-
-def _moved(command: str) -> str:
-    """A command of this name below another one, as a hint."""
-    build_parser()
-    below = [name for name in (*GROUPS, *DECLARED) if name.split()[1:2] == [command]]
-    return f"did you mean '{below[0]}'?" if below else ""
 
 
 def _completing() -> Parser:

@@ -77,8 +77,8 @@ def path(text: str) -> Path:
 
 
 READERS: Mapping[str, Callable[[str], Any]] = {
-    **dict.fromkeys(("S", "M", "PX", "DEG", "HZ"), positive_number),
-    **dict.fromkeys(("RAD", "X", "Y", "Z", "U", "V", "LOW", "HIGH", "MM"), finite_number),
+    **dict.fromkeys(("S", "M", "MM", "PX", "DEG", "HZ"), positive_number),
+    **dict.fromkeys(("RAD", "X", "Y", "Z", "U", "V", "LOW", "HIGH"), finite_number),
     **dict.fromkeys(("FILE", "DIR", "FOLDER", "IN", "OUT", "SURVEY"), path),
     "SEED": at_least(0),
     "N": at_least(1),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
@@ -189,10 +190,8 @@ def refuse(error: BaseException, as_json: bool) -> int:
     known = as_command_error(error)
     message = one_line(str(known)) or known.code
     if as_json:
-        body: dict[str, Any] = {"code": known.code, "message": message}
-        if known.detail:
-            body["detail"] = dict(known.detail)
-        _print_json({"error": body})
+        detail = {"detail": dict(known.detail)} if known.detail else {}
+        _print_json({"error": {"code": known.code, "message": message, **detail}})
         sys.stdout.flush()
     else:
         sys.stderr.write(f"mastctl: {message}\n")
@@ -215,24 +214,23 @@ def as_command_error(error: BaseException) -> CommandError:
 
     if isinstance(error, CommandError):
         return error
-    if isinstance(error, BadFile):
-        return CommandError("bad_file", str(error), 2, {"path": str(error.path), "place": error.place})
-    if isinstance(error, Unreachable):
-        return CommandError("unreachable", str(error), 1, {"reason": error.code})
-    if isinstance(error, BadOptions):
-        return CommandError("bad_options", str(error), 2)
     code, detail = getattr(error, "code", None), getattr(error, "detail", None)
+    exit_code = 2 if isinstance(error, (BadFile, BadOptions)) else int(getattr(error, "exit_code", 1))
+    if isinstance(error, BadFile):
+        detail = {"path": str(error.path), "place": error.place}
+    elif isinstance(error, Unreachable):
+        code, detail = "unreachable", {"reason": error.code}
     if isinstance(error, (CalibError, DriverError)) or isinstance(code, str):
-        name = type(error).__name__
-        snake = "".join(f"_{c.lower()}" if c.isupper() and i else c.lower() for i, c in enumerate(name))
-        detail = detail if isinstance(detail, Mapping) else None
-        return CommandError(code or snake, str(error), int(getattr(error, "exit_code", 1)), detail)
+        snake = re.sub(r"(?<!^)([A-Z])", r"_\1", type(error).__name__).lower()
+        return CommandError(
+            code or snake, str(error), exit_code, detail if isinstance(detail, Mapping) else None
+        )
     if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename is not None else ""
-        return CommandError("file_system", f"{where}{error.strerror or error}", 1)
+        return CommandError("file_system", f"{where}{error.strerror or error}")
     if isinstance(error, MemoryError):
-        return CommandError("out_of_memory", "not enough memory for this input", 1)
-    return CommandError("internal", f"a defect of the program: {type(error).__name__}: {error}", 1)
+        return CommandError("out_of_memory", "not enough memory for this input")
+    return CommandError("internal", f"a defect of the program: {type(error).__name__}: {error}")
 
 
 def progress_bar(quiet: bool) -> Progress:

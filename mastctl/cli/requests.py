@@ -12,7 +12,7 @@ from urllib.parse import quote
 from mastctl.cli import output
 from mastctl.cli.daemon import CONFIG, DAEMON, URL, client_of
 from mastctl.cli.options import GROUPS, Option, angle_rad, command, finite_number, option
-from mastctl.cli.output import Answer, CommandError, WrongUse, check_file, tables_at
+from mastctl.cli.output import Answer, CommandError, WrongUse, tables_at
 
 if TYPE_CHECKING:
     from mastctl.client import Client
@@ -29,8 +29,6 @@ GROUPS |= {
 TRACK = "state pair range_m position_m predicted operation reason"
 """What people see of a track."""
 
-FOR = option("--for S", "how long, seconds up to 3600 (default: 30, or as before)", dest="for_s")
-OWN_LEASE = (URL, CONFIG, option("--lease ID", "as 'mastctl rig lease take' prints it", required=True))
 
 Send = Callable[["Client", argparse.Namespace], Mapping[str, Any]]
 
@@ -49,7 +47,6 @@ class Request(NamedTuple):
     example: str = ""
     line: str = ""
     keys: str = ""
-    daemon: tuple[Option, ...] = DAEMON
 
     def run(self, args: argparse.Namespace) -> Answer:
         """Send it and return the answer."""
@@ -69,15 +66,6 @@ class Request(NamedTuple):
         if self.line:
             return Answer(answer, self.line.format_map(answer))
         return Answer(answer, tables_at(answer, self.keys))
-
-
-def _mast(client: Client, args: argparse.Namespace) -> Mapping[str, Any]:
-    """The mast files of a daemon; the one in use is written to --out, byte for byte."""
-    status = client.status()
-    if args.out is not None:
-        check_file(args.out, "--out")
-        args.out.write_bytes(client.mast_file())
-    return {"mast": status["mast"], "former_mast": status["former_mast"]}
 
 
 def _clear_faults(client: Client, args: argparse.Namespace) -> Mapping[str, Any]:
@@ -111,35 +99,16 @@ REQUESTS = (
     Request(
         "rig lease take",
         "acquire the lease and print its id, for --lease; with --reason from its holder",
-        lambda client, args: client.acquire_lease(args.name, args.for_s or 30.0, args.reason),
+        lambda client, args: client.acquire_lease(args.name, args.for_s, args.reason),
         (
             option("--name NAME", "the holder's name (default: user@host)"),
             option("--reason TEXT", "take the lease from its holder, and show the holder this reason"),
-            FOR,
+            option("--for S", "how long, seconds up to 3600", dest="for_s", default=30.0),
         ),
         "--for 60",
         line="{lease_id}",
     ),
-    Request(
-        "rig lease renew",
-        "have a lease run on from now",
-        "POST /lease/renew for_s",
-        (FOR,),
-        "--lease 0f3c --for 60",
-        keys="holder for_s until",
-        daemon=OWN_LEASE,
-    ),
-    Request(
-        "rig lease release", "let others steer", "DELETE /lease", (), "--lease 0f3c", "released",
-        daemon=OWN_LEASE,
-    ),
-    Request(
-        "rig mast show",
-        "show which is in use, and which was before",
-        _mast,
-        (option("--out FILE", "write the one in use to this file too, byte for byte"),),
-        "--out now.yaml",
-    ),
+    Request("rig lease release", "let others steer", "DELETE /lease", (), "--lease 0f3c", "released"),
     Request(
         "rig mast use",
         "use another of the same folder; pictures taken before are refused",
@@ -232,7 +201,7 @@ REQUESTS = (
 )  # fmt: skip
 
 for _one in REQUESTS:
-    command(_one.name, *_one.options, *_one.daemon, help=_one.help, example=_one.example)(_one.run)
+    command(_one.name, *_one.options, *DAEMON, help=_one.help, example=_one.example)(_one.run)
 
 
 TOKEN = (URL, CONFIG, option("--state FOLDER", "state folder of a daemon that does not run now"))

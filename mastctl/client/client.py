@@ -64,18 +64,11 @@ class Snapshot(FrameFacts):
 class Client(LeaseCalls, Calls):
     """A connection to one daemon. A context manager; usable from one thread at a time.
 
-    Parameters
-    ----------
-    url
-        ``http://127.0.0.1:8420``, or ``unix:/path/of/socket``.
-    timeout_s
-        Longest time of each request, seconds.
-    name
-        The name of this program, for the daemon's record and for other clients that want to steer; by default
-        ``program@host:pid``. Clients of one name are one party.
-    token
-        Expected by a daemon from other machines; by default ``$MASTCTL_TOKEN``. Others can read it on the way
-        without TLS. The file ``$MASTCTL_CA_FILE`` may name further certificates.
+    ``url``: ``http://127.0.0.1:8420``, or ``unix:/path/of/socket``. ``timeout_s``: longest time of each
+    request. ``name`` of this program, for the daemon's record and for other clients that want to steer, is by
+    default ``program@host:pid``; clients of one name are one party. ``token``: expected by a daemon from
+    other machines; by default ``$MASTCTL_TOKEN``. Others can read it on the way without TLS. The file
+    ``$MASTCTL_CA_FILE`` may name further certificates.
 
     Where the connection breaks, the client sends a command again; its key lets the daemon execute it once.
     Every method raises ClientError for whatever goes wrong.
@@ -124,7 +117,6 @@ class Client(LeaseCalls, Calls):
         range_m: float | None = None,
         plane: Mapping[str, Sequence[float]] | None = None,
         deadline_s: float | None = None,
-        idempotency_key: str | None = None,
     ) -> str:
         """Start a pointing operation and return its id.
 
@@ -132,21 +124,12 @@ class Client(LeaseCalls, Calls):
         (default) or ``site`` frame; ``panorama``, a pixel of one: ``id``, ``x_px``, ``y_px``, perhaps
         ``recompute``, ``by_direction``; the joint angles.
 
-        Parameters
-        ----------
-        aim
-            (camera, x, y): where the target shall come; the daemon's default when left out.
-        pointings
-            1 (default) or 2.
-        range_m, plane
-            How far what the pixel shows is from its camera, metres, or a plane of the rover frame in which it
-            lies: ``{"point_m": (x, y, z), "normal": (x, y, z)}``, level without ``normal``. The pair's other
-            camera is not used then.
-        deadline_s
-            How long it is given, seconds of the daemon's clock; then the head is stopped and the operation
-            fails with ``deadline_passed``. By default from the longest move and the speed.
-        idempotency_key
-            The same for each try of one command; a new one by default.
+        ``aim`` (camera, x, y): where the target shall come; the daemon's default when left out.
+        ``pointings``: 1 (default) or 2. ``range_m``: how far what the pixel shows is from its camera, or
+        ``plane`` of the rover frame in which it lies, ``{"point_m": (x, y, z), "normal": (x, y, z)}``, level
+        without ``normal``; the pair's other camera is not used then. ``deadline_s``: how long it is given,
+        seconds of the daemon's clock; then the head is stopped and the operation fails with
+        ``deadline_passed``. By default from the longest move and the speed.
         """
         body = given(
             **_target(pixel, position_m, frame, aim, range_m, plane),
@@ -155,12 +138,10 @@ class Client(LeaseCalls, Calls):
             tilt_rad=tilt_rad,
             pointings=pointings,
         )
-        return self._started("/point", body, idempotency_key, deadline_s)
+        return self._started("/point", body, deadline_s)
 
-    def _started(
-        self, path: str, body: dict[str, Any] | None, key: str | None, deadline_s: float | None
-    ) -> str:
-        return self.daemon.command(answers.Started, "POST", path, body, key=key, deadline_s=deadline_s)["id"]
+    def _started(self, path: str, body: dict[str, Any] | None, deadline_s: float | None) -> str:
+        return self.daemon.command(answers.Started, "POST", path, body, deadline_s=deadline_s)["id"]
 
     def turn(self, pan_rad: float, tilt_rad: float, timeout_s: float = 90.0) -> answers.OperationAnswer:
         """Turn to joint angles as the head reads them; return the operation's record when it has ended.
@@ -181,23 +162,6 @@ class Client(LeaseCalls, Calls):
                     daemon.json(dict[str, Any], "POST", path)
                 daemon.close()
             raise
-
-    def preview(
-        self,
-        pixel: tuple[str, str, float, float],
-        *,
-        aim: tuple[str, float, float] | None = None,
-        range_m: float | None = None,
-        plane: Mapping[str, Sequence[float]] | None = None,
-    ) -> answers.Preview:
-        """Return what a pixel (camera, frame id, x, y) shows and where `point` would send the head.
-
-        Nothing moves. ``position_m`` with ``sigma_m``, ``range_m``, the match in the other camera,
-        ``goal_rad``, and ``refused`` where the head would not be sent. ``range_m`` and ``plane`` as for
-        `point`.
-        """
-        body = _target(pixel, None, None, aim, range_m, plane)
-        return self.daemon.json(answers.Preview, "POST", "/point/preview", json=body)
 
     def operation(self, operation_id: str) -> answers.OperationAnswer:
         """Return an operation's record."""
@@ -297,14 +261,13 @@ class Client(LeaseCalls, Calls):
         position_m: Sequence[float] | None = None,
         frame: Literal["rover", "site"] | None = None,
         deadline_s: float | None = None,
-        idempotency_key: str | None = None,
     ) -> str:
         """Start to follow a target and return the operation's id; arguments as for `point`."""
-        return self._started("/track", _target(pixel, position_m, frame), idempotency_key, deadline_s)
+        return self._started("/track", _target(pixel, position_m, frame), deadline_s)
 
-    def look(self, *, deadline_s: float | None = None, idempotency_key: str | None = None) -> str:
+    def look(self, *, deadline_s: float | None = None) -> str:
         """Look for the track's target once more; return the operation's id."""
-        return self._started("/track/look", None, idempotency_key, deadline_s)
+        return self._started("/track/look", None, deadline_s)
 
     def wait_track(
         self,
@@ -330,29 +293,11 @@ class Client(LeaseCalls, Calls):
         return self.daemon.json(answers.TrackAnswer, "POST", "/track/stop")
 
     def jog(self) -> Jog:
-        """Return a context in which the head turns at rates; it sends the heartbeats itself.
-
-        Examples
-        --------
-        ::
-
-            with client.jog() as jog:
-                jog.rates(0.2, 0.0)      # rad/s
-                time.sleep(1.5)
-        """
+        """Return a context in which the head turns at the `Jog.rates` set; it sends the heartbeats itself."""
         return Jog(lambda: self.daemon.beside(ANSWER_S))
 
     def live_pictures(self, *cameras: str) -> AbstractContextManager[LivePictures]:
-        """Return a context in which pictures of some cameras come, as JPEG at the cameras' own rate.
-
-        Examples
-        --------
-        ::
-
-            with client.live_pictures("navcam_left") as pictures:
-                pictures.wanted("navcam_left")
-                picture = pictures.next(timeout_s=1.0)     # facts, jpeg; None if there was none
-        """
+        """Return a context in which pictures of some cameras come, as JPEG at the cameras' own rate."""
         try:
             from mastctl.client.pictures import live_pictures  # WebSockets, only where pictures are watched
         except ImportError:
@@ -381,7 +326,7 @@ class Client(LeaseCalls, Calls):
             raise self.daemon.bad_answer(f"the picture's facts are wrong: {reason}") from None
 
     def close(self) -> None:
-        """Let go of the connection."""
+        """Close the connection."""
         self.daemon.close()
 
     def __enter__(self) -> Client:

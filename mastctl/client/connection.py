@@ -113,7 +113,6 @@ class DaemonHttp:
         path: str,
         body: Mapping[str, Any] | None = None,
         *,
-        key: str | None = None,
         deadline_s: float | None = None,
         **options: Any,
     ) -> T:
@@ -122,7 +121,7 @@ class DaemonHttp:
         Where the connection breaks the request is sent again with the same key, by which the daemon gives the
         first one's answer and does nothing twice.
         """
-        headers = {"Idempotency-Key": key or secrets.token_hex(16)}
+        headers = {"Idempotency-Key": secrets.token_hex(16)}
         if deadline_s is not None:
             headers["Deadline-S"] = repr(float(deadline_s))
         if body is not None:

@@ -9,57 +9,12 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from mastctl import answers
-from mastctl.client.connection import Broken, ClientError, DaemonHttp, escaped, given, plain_name, polled
+from mastctl.client.connection import ClientError, DaemonHttp, escaped, given, plain_name, polled
 
 RENEWALS = 3  # within a lease's time, so that one may be lost
 LEAST_TIMEOUT_S = 0.5
 BEAT_S = 0.12  # the daemon waits 0.5 s: three may get lost
 ANSWER_S = 1.0
-
-
-class HeldLease:
-    """The right to steer, as long as no other client takes over; `LeaseCalls.lease` makes one.
-
-    ``lost``: why the lease is over, None while it lasts; the next command is refused with the same reason.
-    """
-
-    def __init__(self, daemon: DaemonHttp, granted: answers.LeaseGranted, for_s: float) -> None:
-        self.id = str(granted["lease_id"])
-        self.holder = str(granted["holder"])
-        self.lost: ClientError | None = None
-        self._for_s = for_s
-        self._until_s = time.monotonic() + for_s
-        # A connection of its own: the client's may be busy with a long wait.
-        timeout_s = max(LEAST_TIMEOUT_S, for_s / RENEWALS)
-        self._daemon = daemon.beside(min(daemon.timeout_s, timeout_s))
-        self._daemon.lease_id = self.id
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._renew, name="lease", daemon=True)
-        self._thread.start()
-
-    def end(self) -> None:
-        """Renew no more and let others steer; never raises, since what was done was done."""
-        self._ended.set()
-        self._thread.join()
-        if self.lost is None:
-            with contextlib.suppress(ClientError):
-                self._daemon.json(answers.LeaseAnswer, "DELETE", "/lease")
-        self._daemon.close()
-
-    def _renew(self) -> None:
-        """Renew until the end; without an answer, again until the lease is over."""
-        while not self._ended.wait(self._for_s / RENEWALS):
-            sent_s = time.monotonic()
-            try:
-                renewal = {"for_s": self._for_s}
-                self._daemon.json(answers.LeaseGranted, "POST", "/lease/renew", json=renewal)
-                self._until_s = sent_s + self._for_s
-            except ClientError as error:
-                passing = isinstance(error, Broken) or error.code in ("no_daemon", "timeout")
-                if passing and time.monotonic() < self._until_s:
-                    continue
-                self.lost = error
-                return
 
 
 class LeaseCalls:
@@ -74,11 +29,12 @@ class LeaseCalls:
         for_s: float = 30.0,
         take_over: str | None = None,
         ends_with_stop: bool = False,
-    ) -> Iterator[HeldLease]:
+    ) -> Iterator[None]:
         """Steer alone inside the block: a thread renews the lease, and this client's commands carry it.
 
         A motion that still runs when the lease ends, by the block's end too, is stopped: wait for it. Raises
-        ClientError ``leased`` if another client steers.
+        ClientError ``leased`` if another client steers; once another has taken over, each command is refused
+        with the reason.
 
         ``name`` is the holder's, by default this client's; the lease outlives a holder that falls silent by
         ``for_s``, 1 to 3600 s. ``take_over``: the reason for taking it from the client that steers.
@@ -86,13 +42,21 @@ class LeaseCalls:
         next move otherwise.
         """
         granted = self.acquire_lease(name, for_s, take_over, ends_with_stop)
-        before, lease = self.daemon.lease_id, HeldLease(self.daemon, granted, for_s)
-        self.daemon.lease_id = lease.id
+        before, self.daemon.lease_id = self.daemon.lease_id, granted["lease_id"]
+        # A connection of its own: the client's may be busy with a long wait.
+        beside = self.daemon.beside(min(self.daemon.timeout_s, max(LEAST_TIMEOUT_S, for_s / RENEWALS)))
+        ended = threading.Event()
+        thread = threading.Thread(target=_renewed, args=(beside, ended, for_s), name="lease", daemon=True)
+        thread.start()
         try:
-            yield lease
+            yield
         finally:
             self.daemon.lease_id = before
-            lease.end()
+            ended.set()
+            thread.join()
+            with contextlib.suppress(ClientError):  # what was done was done
+                beside.json(answers.LeaseAnswer, "DELETE", "/lease")
+            beside.close()
 
     def control(self) -> answers.ControlAnswer | None:
         """Return the client that steers, or None."""
@@ -120,6 +84,19 @@ class LeaseCalls:
     def release_lease(self) -> None:
         """Release the lease in use."""
         self.daemon.command(answers.LeaseAnswer, "DELETE", "/lease")
+
+
+def _renewed(daemon: DaemonHttp, ended: threading.Event, for_s: float) -> None:
+    """Renew a lease until the end; without an answer, again until the lease is over."""
+    until_s = time.monotonic() + for_s
+    while not ended.wait(for_s / RENEWALS):
+        sent_s = time.monotonic()
+        try:
+            daemon.json(answers.LeaseGranted, "POST", "/lease/renew", json={"for_s": for_s})
+            until_s = sent_s + for_s
+        except ClientError as error:
+            if error.code not in ("no_daemon", "timeout") or time.monotonic() >= until_s:
+                return
 
 
 class Jog:

@@ -25,7 +25,7 @@ from drivers.interfaces import Camera, Frame, Image, Reading
 from mastctl.devices.devices import Devices
 from mastctl.devices.judge import Limits
 from mastctl.devices.thread import DeviceThread
-from mastctl.errors import MastctlError, Stopped
+from mastctl.errors import MastctlError
 from mastctl.setup.sync_fit import REACH_S, CannotTell, JointMotion, OffsetFit, fit_offset
 
 SIGNIFICANT_SIGMAS = 3.0
@@ -103,8 +103,7 @@ def _view_rad(rig: Rig, camera: str) -> float:
 class Sweep:
     """One measurement by the head of ``devices`` and open cameras on it, by name.
 
-    ``stop``, set from anywhere, ends it: the head is halted where it is. ``clock`` stamps readings and
-    frames.
+    An interrupt halts the head where it is. ``clock`` stamps readings and frames.
     """
 
     def __init__(
@@ -113,14 +112,12 @@ class Sweep:
         cameras: Mapping[str, Camera],
         rig: Rig,
         limits: Limits,
-        stop: threading.Event,
         clock: Clock,
     ) -> None:
         self._devices = devices
         self._cameras = cameras
         self._rig = rig
         self._limits = limits
-        self._stop = stop
         self._clock = clock
         self._over = threading.Event()
         self._readings: list[Reading] = []
@@ -130,7 +127,7 @@ class Sweep:
         """Sweep, and bring the head back to its start; a camera's failure is in `seen`.
 
         Raises OutsideLimits and KeptOut before anything moves, if the sweep would pass a limit or a keep-out;
-        Stopped if it was stopped, and DriverError if the head fails: it is at rest then.
+        DriverError if the head fails: it is at rest then.
         """
         self._rest()
         start = self._devices.read()
@@ -141,7 +138,6 @@ class Sweep:
         self._limits.speed(plan.speed_rad_per_s)
         for name in self._cameras:
             self._choose(name, start, plan)
-        self._check_stop()
         threads = [
             self._clock.thread(partial(self._follow, name), f"sweep {name}")
             for name, seen in self.seen.items()
@@ -207,10 +203,6 @@ class Sweep:
             )
         return found | vars(fit) | {"offset_s": in_use_s + fit.offset_s, "left_s": fit.offset_s}
 
-    def _check_stop(self) -> None:
-        if self._stop.is_set():
-            raise Stopped("it was stopped; the head is at rest there")
-
     def _note(self) -> Reading:
         """Record the newest reading."""
         reading = self._devices.last_reading
@@ -219,11 +211,6 @@ class Sweep:
         if not self._readings or reading.time_s > self._readings[-1].time_s:
             self._readings.append(reading)
         return reading
-
-    def _pause(self) -> None:
-        self._check_stop()
-        self._clock.sleep(READ_EVERY_S)
-        self._check_stop()
 
     def _rest(self) -> None:
         """Wait until the head has been at rest for long enough."""
@@ -234,7 +221,7 @@ class Sweep:
                 since_s = self._clock.now_s()
             if self._clock.now_s() > until_s:
                 raise NoReply("the head does not come to rest", device="pan_tilt")
-            self._pause()
+            self._clock.sleep(READ_EVERY_S)
 
     def _to_and_fro(self, start: Reading, plan: SweepPlan) -> int:
         """Turn for the plan's time, and return how many ways that made: no more than any camera sees."""
@@ -248,7 +235,6 @@ class Sweep:
 
     def _go(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float) -> None:
         """Go there, and record readings until the head is at rest."""
-        self._check_stop()
         self._devices.move(pan_rad, tilt_rad, speed_rad_per_s)
         sent_s = self._clock.now_s()
         while True:
@@ -257,7 +243,7 @@ class Sweep:
                 return
             if self._clock.now_s() - sent_s > ARRIVE_S:
                 raise NoReply(f"the head does not come to pan {pan_rad:.3f} rad", device="pan_tilt")
-            self._pause()
+            self._clock.sleep(READ_EVERY_S)
 
     def _choose(self, name: str, start: Reading, plan: SweepPlan) -> None:
         """Take a camera's image at rest and choose what to follow in it; its failure is in `seen`."""

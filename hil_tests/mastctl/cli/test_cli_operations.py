@@ -83,13 +83,11 @@ def test_options_of_another_use_are_refused(
     assert message in capsys.readouterr().err
 
 
-def test_the_mast_file_is_shown_replaced_and_put_back(
+def test_the_mast_file_is_replaced_and_put_back(
     pair: BOTH, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     url = ("--url", pair[0].url)
     save_rig(rig(), tmp_path / "other.yaml")
-    assert "little.yaml" in said(capsys, "rig", "mast", "show", "--out", str(tmp_path / "copy"), *url)
-    assert (tmp_path / "copy").read_bytes() == (tmp_path / "little.yaml").read_bytes()
     assert said(capsys, "rig", "mast", "use", "other.yaml", *url).startswith("other.yaml (little")
     assert "before other.yaml" in said(capsys, "rig", "mast", "back", *url)
     assert main(["rig", "mast", "use", "none.yaml", *url]) == 2
