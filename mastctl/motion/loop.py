@@ -21,12 +21,13 @@ a later image does not repeat (`mastctl.motion.measurement`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
 
 from calib.errors import CalibError
+from calib.geometry.line_of_sight import SeenFrom
 from calib.geometry.pointing import Solution, solve
 from calib.geometry.rigid import FloatArray
 from calib.geometry.stereo import Triangulation, triangulate
@@ -112,7 +113,6 @@ class PointingLoop(Steps):
             found, _ = self._sight(request, target)
             one = self._one_camera
             assert one is not None
-            self._position_m = one.position_m
             about = {
                 "range_m": one.sight.range_m,
                 "range_from": one.range_from,
@@ -144,7 +144,17 @@ class PointingLoop(Steps):
         return self._previewed(now, pixel_px, about, aim)
 
     def _previewed(self, now: CameraView, pixel_px: FloatArray, about: dict[str, Any], aim: Aim) -> Preview:
-        goal, refused = self._goal_of(aim)
+        """With the readings that the head would be sent to, and why it would not."""
+        goal: Pair | None = None
+        refused: dict[str, str] | None = None
+        try:
+            start = self.read()
+            best = self._solved(aim, np.array([aim.x_px, aim.y_px]), start, {})
+            goal = self._devices.goal((best.pan_rad, best.tilt_rad), start)
+            self.check_goal(*goal)
+        except (MastctlError, CalibError) as error:
+            message = " ".join(str(error).split())
+            refused = {"code": getattr(error, "code", "failed"), "message": message}
         answer = {
             **dict.fromkeys(Preview.__annotations__),
             **about,
@@ -157,19 +167,6 @@ class PointingLoop(Steps):
             "refused": refused,
         }
         return cast(Preview, as_json(answer))
-
-    def _goal_of(self, aim: Aim) -> tuple[Pair | None, dict[str, str] | None]:
-        """The readings that the head would be sent to, and why it would not."""
-        goal: Pair | None = None
-        try:
-            now = self.read()
-            best = self._solved(aim, np.array([aim.x_px, aim.y_px]), now, {})
-            goal = self._devices.goal((best.pan_rad, best.tilt_rad), now)
-            self.check_goal(*goal)
-        except (MastctlError, CalibError) as error:
-            message = " ".join(str(error).split())
-            return goal, {"code": getattr(error, "code", "failed"), "message": message}
-        return goal, None
 
     def _return_to(self, view_rad: Pair, camera: str) -> None:
         """Go to where a kept picture was taken, so that a fresh one shows the same."""
@@ -194,7 +191,7 @@ class PointingLoop(Steps):
             now = self.capture((aim.camera,), settled)[aim.camera]
             self._measured(commanded, now, aim_px, None)
         elif self._is_alone(request, target):
-            self._point_by_one(self._sight(request, target)[1], aim, aim_px, request.pointings)
+            self._point(self._sight(request, target)[1], aim, aim_px, request.pointings)
         else:
             self._range_from = "stereo"
             found, partnered, _ = self._in_stereo(target)
@@ -202,7 +199,7 @@ class PointingLoop(Steps):
             assert plane is not None and relief is not None
             relief = relief.seen_by(found.view.camera, found.clicked_px, plane, found.now.camera)
             clicked = Clicked(found.view, found.clicked_px, plane, relief=relief)
-            self._point_by_pair(clicked, aim, aim_px, request.pointings)
+            self._point(clicked, aim, aim_px, request.pointings)
 
     def _in_stereo(self, target: PixelTarget) -> tuple[FoundAgain, StereoMatch, Triangulation]:
         """Find the clicked thing in a fresh pair, and its position."""
@@ -225,44 +222,9 @@ class PointingLoop(Steps):
         found = self.clicked(target, alone=True)
         with self.step("sight") as detail:
             one = OneCamera(self._rig, self._devices.reading_sigma_rad, found, request)
-            self._one_camera = one
+            self._one_camera, self._position_m = one, one.position_m
             detail.update(one.facts())
             return found, one.clicked(found)
-
-    def _point_by_one(self, clicked: Clicked, aim: Aim, aim_px: FloatArray, pointings: int) -> None:
-        """Point once or twice at what one camera saw, and measure each time."""
-        one = self._one_camera
-        assert one is not None
-        for number in range(1, pointings + 1):
-            self._position_m = one.position_m
-            resting = self.rest() if number > 1 else None
-            commanded, settled = self._solve_and_go(aim, aim_px, resting)
-            now = self.capture((aim.camera,), settled)[aim.camera]
-            with self.step("measure") as detail:
-                expected = one.expected(now)
-                try:
-                    seen = self.cameras.find(clicked, now)
-                except PointingError as error:
-                    if one.range_from != "unknown" or not error.code.startswith("target_"):
-                        raise
-                    message = f"{error}; how far it is was not known: give range_m or a plane"
-                    raise PointingError(error.code, message) from None
-                detail.update(
-                    camera=aim.camera, **match_facts(seen), residual_px=rounded(seen.pixel_px - aim_px)
-                )
-                detail.update(predicted_px=rounded(expected.pixel_px), **one.check(now, seen, expected))
-            match_px = float(seen.sigma_px.max())
-            later, again = self._repeated(clicked, now, seen, settled, aim_px)
-            known = expected.whole_px2(one.sight.inverse_sigma_m) + match_px**2 * np.eye(2)
-            predicted = {
-                "predicted_sigma_px": np.sqrt(np.diag(known)).tolist(),
-                "predicted_covariance_px2": known.tolist(),
-            }
-            self._measured(commanded, later, aim_px, again, **predicted)
-            with self.step("range") as detail:
-                one.learn(now, seen.pixel_px, match_px, expected)
-                detail.update(one.facts())
-        self._position_m, self._range_m = one.position_m, one.sight.range_m
 
     def _triangulate(
         self, one: CameraView, one_px: FloatArray, other: CameraView, seen: PatchMatch
@@ -282,34 +244,64 @@ class PointingLoop(Steps):
             )
         return point
 
-    def _point_by_pair(self, clicked: Clicked, aim: Aim, aim_px: FloatArray, pointings: int) -> None:
+    def _point(self, clicked: Clicked, aim: Aim, aim_px: FloatArray, pointings: int) -> None:
         """Point once or twice at the clicked thing and measure each time."""
-        source = clicked.view.frame.camera
+        one, source = self._one_camera, clicked.view.frame.camera
+        expected: SeenFrom | None = None
         for number in range(1, pointings + 1):
             commanded, settled = self._solve_and_go(aim, aim_px, self.rest() if number > 1 else None)
             assert self._position_m is not None
-            companions = self.cameras.companions(aim.camera, source, self._position_m, settled)
+            companions: tuple[str, ...] = ()
+            if one is None:
+                companions = self.cameras.companions(aim.camera, source, self._position_m, settled)
             views = self.capture((aim.camera, *companions), settled)
             now = views.pop(aim.camera)
             with self.step("measure") as detail:
-                seen = self.cameras.find(clicked, now)
-                detail.update(camera=aim.camera, **match_facts(seen), predicted_px=rounded(seen.predicted_px))
+                if one is None:
+                    seen = self.cameras.find(clicked, now)
+                    predicted_px = seen.predicted_px
+                else:
+                    expected = one.expected(now)
+                    seen = one.find(self.cameras, clicked, now)
+                    predicted_px = expected.pixel_px
+                detail.update(camera=aim.camera, **match_facts(seen), predicted_px=rounded(predicted_px))
                 detail.update(residual_px=rounded(seen.pixel_px - aim_px))
-            confirmed: list[tuple[CameraView, PatchMatch]] = [(now, seen)]
-            with self.step("eyes") as detail:
-                detail.update(confirmed_by=list(companions))
-                if views:
-                    others = list(views.values())
-                    detail.update(self.cameras.check_one_moment(now, seen.pixel_px, others, settled))
-                for name, other in views.items():
-                    self.check_not_stopped()
-                    same_pair = {aim.camera, name} == {source, self.cameras.partner(source)}
-                    found, detail[name] = self.cameras.agree(clicked, now, seen, other, same_pair)
-                    confirmed.append((other, found))
+                if one is not None and expected is not None:
+                    detail.update(one.check(now, seen, expected))
+            confirmed = [(now, seen)]
+            if one is None:
+                confirmed += self._confirmed(clicked, now, seen, views)
             later, again = self._repeated(clicked, now, seen, settled, aim_px)
-            self._measured(commanded, later, aim_px, again)
-            if number < pointings:
-                self._measure_again(confirmed)
+            if one is None or expected is None:
+                self._measured(commanded, later, aim_px, again)
+                if number < pointings:
+                    self._measure_again(confirmed)
+                continue
+            self._measured(commanded, later, aim_px, again, **one.predicted(seen, expected))
+            with self.step("range") as detail:
+                one.learn(now, seen.pixel_px, float(seen.sigma_px.max()), expected)
+                self._position_m = one.position_m
+                detail.update(one.facts())
+        if one is not None:
+            self._range_m = one.sight.range_m
+
+    def _confirmed(
+        self, clicked: Clicked, now: CameraView, seen: PatchMatch, others: Mapping[str, CameraView]
+    ) -> list[tuple[CameraView, PatchMatch]]:
+        """Have other cameras confirm what the aiming one shows; their views and matches.
+
+        That the thing does not move between exposures of several cameras follows from the repetition.
+        """
+        pair = {clicked.view.frame.camera, self.cameras.partner(clicked.view.frame.camera)}
+        confirmed = []
+        with self.step("eyes") as detail:
+            detail.update(confirmed_by=list(others))
+            for name, other in others.items():
+                self.check_not_stopped()
+                same_pair = {now.frame.camera, name} == pair
+                found, detail[name] = self.cameras.agree(clicked, now, seen, other, same_pair)
+                confirmed.append((other, found))
+        return confirmed
 
     def _repeated(
         self, clicked: Clicked, first: CameraView, seen: PatchMatch, settled: HeadReading, aim_px: FloatArray

@@ -29,7 +29,7 @@ from calib.matching.patch import PatchMatch
 from calib.matching.shown_view import FLOOR_RAD
 from calib.matching.warp import Plane, facing_plane
 from mastctl.devices.keep_out import Pair
-from mastctl.motion.measurement import ACROSS_PX, CameraView, Clicked, rounded
+from mastctl.motion.measurement import ACROSS_PX, CameraView, Clicked, RigCameras, rounded
 from mastctl.motion.requests import PointingError, PointRequest
 from mastctl.motion.steps import FoundAgain
 
@@ -109,6 +109,23 @@ class OneCamera:
             sigma_rad=self._sigma_rad,
             calibration=self._calibration,
         )
+
+    def find(self, cameras: RigCameras, clicked: Clicked, now: CameraView) -> PatchMatch:
+        """Find the clicked thing in a new view. Raises PointingError as `RigCameras.find`."""
+        try:
+            return cameras.find(clicked, now)
+        except PointingError as error:
+            if self.range_from != "unknown" or not error.code.startswith("target_"):
+                raise
+            message = f"{error}; how far it is was not known: give range_m or a plane"
+            raise PointingError(error.code, message) from None
+
+    def predicted(self, seen: PatchMatch, expected: SeenFrom) -> dict[str, Any]:
+        """Return how sure the prediction of a view was, for its pointing."""
+        match_px = float(seen.sigma_px.max())
+        known = expected.whole_px2(self.sight.inverse_sigma_m) + match_px**2 * np.eye(2)
+        sigma_px = np.sqrt(np.diag(known))
+        return {"predicted_sigma_px": sigma_px.tolist(), "predicted_covariance_px2": known.tolist()}
 
     def check(self, now: CameraView, seen: PatchMatch, expected: SeenFrom) -> dict[str, float]:
         """Pass a match that lies where the range can put it; return how far off, for the record.
