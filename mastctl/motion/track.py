@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from calib.geometry.rig import Rig
-from calib.geometry.rigid import FloatArray, Rigid, carried_covariance, quaternion_of
+from calib.geometry.rigid import FloatArray, Rigid, quaternion_of
 from calib.matching.handoff import MatchedHandoff
 from calib.matching.track import Track, moved_track
 from drivers.clock import Clock
@@ -37,9 +37,13 @@ log = logging.getLogger(__name__)
 STILL_M, STILL_RAD = 0.005, 0.001
 """Within these of each other two poses are one, stated twice: an odometer's noise, no motion."""
 
-HELD_UP_S = 60.0
+LATE_S = 60.0
 """No pose is longer on its way. One that seems so was stamped by a clock that was set, or by another one."""
 
+WITHOUT_COVARIANCE = (
+    "the rover moved, and its pose was refused: it had no covariance, which says where to look; begin the "
+    "track again"
+)
 ACTIVE: frozenset[TrackState] = frozenset({"starting", "tracking", "lost"})
 FIRST_POSE = (
     "the rover's first pose came while the track ran: how far the rover moved since the track began is not "
@@ -78,21 +82,11 @@ def check_follows(pose: RoverPose, before: RoverPose | None) -> None:
     """Pass a pose that is later than the one before it, or has another clock than that one.
 
     The sender's clock may be any, so no time of it is impossible, and none binds later poses for more than
-    `HELD_UP_S`: a pose that is not later by it is refused while it may have been delayed on its way. Raises
-    BadRequest ``pose_without_time``, NotNow ``pose_runs_backwards``.
+    `LATE_S`. Raises NotNow ``pose_runs_backwards`` for one that may have been delayed on its way.
     """
-    if before is None or before.time_s is None:
+    if before is None or before.time_s is None or pose.time_s is None or pose.time_s > before.time_s:
         return
-    passed_s = pose.received_s - before.received_s
-    if pose.time_s is None:
-        if passed_s > HELD_UP_S:
-            return
-        raise BadRequest(
-            "pose_without_time",
-            f"time_s is missing. The pose before had one ({before.time_s:g} s), and without it the "
-            f"daemon cannot know which is later; {HELD_UP_S:g} s after that pose it may be left out",
-        )
-    if _clock_was_set(pose, before) and before.time_s - pose.time_s + passed_s <= HELD_UP_S:
+    if before.time_s - pose.time_s + pose.received_s - before.received_s <= LATE_S:
         raise NotNow(
             "pose_runs_backwards",
             f"time_s is {pose.time_s:g} s, which is not later than the pose before it ({before.time_s:g} s)",
@@ -110,11 +104,6 @@ def is_still(motion: Rigid) -> bool:
     return float(np.linalg.norm(motion.translation_m)) <= STILL_M and turned_rad <= STILL_RAD
 
 
-def _clock_was_set(pose: RoverPose, before: RoverPose) -> bool:
-    """Whether a pose that follows another is not later than it by their times."""
-    return pose.time_s is not None and before.time_s is not None and pose.time_s <= before.time_s
-
-
 @dataclass(frozen=True, eq=False)
 class TrackStatus:
     """The track at one moment; ``sequence`` grows with each change.
@@ -122,8 +111,7 @@ class TrackStatus:
     ``reason`` is one sentence, where one is needed. ``id`` is the operation that started the track,
     ``operation`` the running start or look. ``track`` is what is followed, or was, in the rover frame of
     ``stands_at``, the pose that it was carried to; ``predicted`` says that the rover moved since it was seen.
-    ``pose`` is the newest; if it jumped, ``owed`` has the covariance (6, 6) of the motions up to it since
-    ``stands_at``. ``seen`` is what the last look saw, ``found_by`` the pair that found the target last.
+    ``pose`` is the newest. ``seen`` is what the last look saw, ``found_by`` the pair that found it last.
     """
 
     sequence: int = 0
@@ -133,7 +121,6 @@ class TrackStatus:
     predicted: bool = False
     track: Track | None = None
     stands_at: RoverPose | None = None
-    owed: tuple[FloatArray, RoverPose] | None = None
     pose: RoverPose | None = None
     seen: TrackSighting | None = None
     found_by: str = ""
@@ -150,35 +137,30 @@ class TrackStatus:
 
     @property
     def covariance_m2(self) -> FloatArray | None:
-        """(3, 3) of the position; None after a pose that jumped."""
-        return None if self.track is None or self.owed is not None else self.track.target_covariance_m2
+        """(3, 3) of the position."""
+        return None if self.track is None else self.track.target_covariance_m2
 
-    def carried_to(self, pose: RoverPose, origin_m: FloatArray, most_step: float) -> TrackStatus:
-        """Return it carried to a pose; lost, and left where it is, if the pose jumped.
+    def carried_to(self, pose: RoverPose) -> TrackStatus:
+        """Return it carried to a pose with a covariance."""
+        assert self.track is not None and self.stands_at is not None and pose.covariance is not None
+        moved = moved_track(self.track, motion_between(self.stands_at, pose), pose.covariance)
+        return replace(self, track=moved, stands_at=pose)
 
-        A pose that jumped is not forgotten: what its motion was uncertain by is part of the next one.
+    def jump(self, pose: RoverPose, origin_m: FloatArray, most_step: float) -> str:
+        """Return how far a pose is from the one before, if that is too far to carry the track over.
+
         ``origin_m`` is (3,), from where the target's range counts, rover frame; ``most_step`` the longest
         way, as a part of that range.
         """
-        track, stood, covariance = self.track, self.stands_at, pose.covariance
-        assert track is not None and stood is not None and covariance is not None
-        if self.owed is not None:
-            before, at = self.owed
-            covariance = covariance + carried_covariance(before, motion_between(at, pose))
-        motion = motion_between(stood, pose)
-        range_m = float(np.linalg.norm(track.position_m - origin_m))
-        way_m = float(np.linalg.norm(motion.translation_m))
-        if way_m > most_step * range_m:
-            reason = (
-                f"the pose jumped by {way_m:.2f} m with the target {range_m:.2f} m away; a track is carried "
-                f"over at most {most_step:g} of the range at a time"
-            )
-            # Whatever is found after this must be confirmed by both cameras.
-            track = replace(track, state="lost")
-            return replace(self, state="lost", reason=reason, track=track, owed=(covariance, pose))
-        reason = self.reason if self.owed is None else "not looked for since a pose jumped"
-        moved = moved_track(track, motion, covariance)
-        return replace(self, reason=reason, track=moved, stands_at=pose, owed=None)
+        assert self.track is not None and self.stands_at is not None
+        range_m = float(np.linalg.norm(self.track.position_m - origin_m))
+        way_m = float(np.linalg.norm(motion_between(self.stands_at, pose).translation_m))
+        if way_m <= most_step * range_m:
+            return ""
+        return (
+            f"the pose jumped by {way_m:.2f} m with the target {range_m:.2f} m away; a track is carried over "
+            f"at most {most_step:g} of the range at a time; begin the track again"
+        )
 
     def as_json(self, now_s: float) -> TrackAnswer:
         """Return it as ``GET /track`` has it."""
@@ -248,7 +230,7 @@ class Tracker:
         self._lock = threading.Lock()
         self._status = TrackStatus()
         self._looking_from: RoverPose | None = None  # where what runs takes its images
-        self._moved = self._left = False  # whether the rover moved from there; by a pose that was refused
+        self._moved = False  # whether the rover moved from there
         self._look_again = False
 
     @property
@@ -294,25 +276,24 @@ class Tracker:
         before anything is looked for from it; it must return at once.
 
         Returns the id of the look; None if there is no track, none is wanted, or none could be started.
-        Raises BadRequest, NotNow if the pose is not later than the one before, or, while a track runs, if it
-        has no covariance: then the track is lost if the rover moved.
+        Raises NotNow if the pose is not later than the one before; BadRequest if it has no covariance while a
+        track runs. A track ends with a motion without one, and with a pose that jumped.
         """
         with self._lock:
             before = self._status.pose
             check_follows(pose, before)
             active = self._status.state in ACTIVE
+            moved = before is not None and not is_still(motion_between(before, pose))
             if active and before is not None and pose.covariance is None:
-                self._lose(motion_between(before, pose))
+                if moved:
+                    self._end(self._status, WITHOUT_COVARIANCE)
                 raise BadRequest(
                     "pose_without_covariance",
                     "covariance (6 rows of 6) or sigma of the motion since the pose before is missing; while "
                     "a track runs it says where to look",
                 )
-            if before is not None and _clock_was_set(pose, before):
-                message = "the clock of the rover's poses was set, or is another: %g s after %g s"
-                log.info(message, pose.time_s, before.time_s)
             on_taken(pose)
-            if before is not None and not is_still(motion_between(before, pose)):
+            if moved:
                 self.moved_s = pose.received_s
             status = replace(self._status, pose=pose)
             if active and before is None:
@@ -323,7 +304,11 @@ class Tracker:
                 moved = stood is not None and not is_still(motion_between(stood, pose))
                 status = replace(status, predicted=status.predicted or moved)
                 if status.track is not None:
-                    status = self._carry(status, pose)
+                    jump = status.jump(pose, self._rig.mast.translation_m, self._settings.most_step)
+                    if jump:
+                        self._end(status, jump)
+                        return None
+                    status = status.carried_to(pose)
                 if status.operation is not None:
                     self._moved = self._moved or moved
                     self._look_again = self._look_again or look
@@ -335,15 +320,12 @@ class Tracker:
     def look(self) -> Operation:
         """Look for the target from the rover's present pose.
 
-        Raises NotNow ``no_track`` if none runs, or the newest pose jumped away from it; ``busy`` if an
-        operation runs.
+        Raises NotNow ``no_track`` if none runs; ``busy`` if an operation runs.
         """
         with self._lock:
             status = self._status
             if status.state not in ACTIVE or status.track is None:
                 raise NotNow("no_track", "no track runs that could be looked for")
-            if status.owed is not None:
-                raise NotNow("no_track", status.reason)
             operation = self._begin_look(status, status.track)
             self._publish(replace(status, operation=operation.id))
             return operation
@@ -371,26 +353,12 @@ class Tracker:
         self._publish(replace(status, state="stopped", reason=reason, operation=None))
         log.info("track %s stopped: %s", status.id, reason)
 
-    def _lose(self, motion: Rigid) -> None:
-        """Declare the target lost if the rover moved by a pose that says too little to be followed."""
-        if is_still(motion):
-            return
-        self._left = True
-        track = self._status.track
-        if track is None:  # its start ends by that
-            return
-        way_m = float(np.linalg.norm(motion.translation_m))
-        reason = f"the rover moved by {way_m:.2f} m, and its pose was refused: it had no covariance"
-        # Whatever is found after this must be confirmed by both cameras.
-        track = replace(track, state="lost")
-        self._publish(replace(self._status, state="lost", predicted=True, reason=reason, track=track))
-
     def _run(
         self, recorded: Mapping[str, Any], work: Callable[[TargetSearch], Outcome], pose: RoverPose | None
     ) -> Operation:
         """Start an operation that looks from a pose; its outcome comes to `_ended`."""
         rig, outcomes = self._rig, list[Outcome]()
-        self._moved = self._left = False
+        self._moved = False
         self._looking_from = pose
 
         def run(record: Callable[[Any], None], cancelled: threading.Event) -> TrackSighting:
@@ -415,21 +383,16 @@ class Tracker:
 
     def _looked_for(self, status: TrackStatus) -> TrackStatus:
         """Begin a look unless that makes no sense now; the status says why not."""
-        if status.track is None or status.owed is not None:
+        if status.track is None:
             return status
         try:
             return replace(status, operation=self._begin_look(status, status.track).id)
         except MastctlError as error:  # a pointing runs, or the service is closing
             return replace(status, reason=f"not looked for yet: {error}")
 
-    def _carry(self, status: TrackStatus, pose: RoverPose) -> TrackStatus:
-        return status.carried_to(pose, self._rig.mast.translation_m, self._settings.most_step)
-
-    def _started(
-        self, status: TrackStatus, operation: Operation, outcome: Outcome | None, left: bool
-    ) -> TrackStatus:
-        """Follow what the first look saw; nothing if it failed or the rover ``left`` meanwhile."""
-        if outcome is None or left:
+    def _started(self, status: TrackStatus, operation: Operation, outcome: Outcome | None) -> TrackStatus:
+        """Follow what the first look saw; nothing if it failed or the rover moved meanwhile."""
+        if outcome is None or self._moved:
             reason = "the rover moved while the track's first pictures were taken; start it again"
             if outcome is None:
                 reason = _why(operation)
@@ -491,7 +454,7 @@ class Tracker:
         matched = None if outcome is None else outcome[1].matched
         with self._lock:
             counts = self._status.operation == operation.id and self._status.state != "starting"
-            counts = counts and not (self._left or self._moved)
+            counts = counts and not self._moved
         if matched is not None and counts:  # without the lock, for which a stop waits: it may take its time
             self._on_matched(matched)
         with self._lock:
@@ -499,9 +462,7 @@ class Tracker:
                 return  # stopped meanwhile
             status = replace(self._status, operation=None)
             if status.state == "starting":
-                status = self._started(status, operation, outcome, self._left or self._moved)
-            elif self._left or status.owed is not None:
-                pass  # it is lost, with the reason
+                status = self._started(status, operation, outcome)
             elif self._moved:
                 reason = "the rover moved while the pictures were taken, so that they belong to no one pose"
                 status = replace(status, reason=reason)

@@ -147,12 +147,13 @@ class Steering:
         if look:
             self._operations.let_stopped_end()
         running = self._tracker.status.operation
-        with self._masts.unchanged():
-            begun = self._tracker.take_pose(pose, look, self._turn_sun)
-        ended = self._tracker.status
-        if running is not None and ended.state not in ACTIVE:
-            self._operations.end(running, Stopped(ended.reason))
-        return begun
+        try:
+            with self._masts.unchanged():
+                return self._tracker.take_pose(pose, look, self._turn_sun)
+        finally:
+            ended = self._tracker.status
+            if running is not None and ended.state not in ACTIVE:
+                self._operations.end(running, Stopped(ended.reason))
 
     def _turn_sun(self, pose: RoverPose) -> None:
         """Keep the sun of the site frame out as it is from a pose."""
