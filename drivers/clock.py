@@ -31,13 +31,9 @@ class Signal(Protocol):
     def wait(self, timeout_s: float | None = None, *, idle: bool = False) -> bool:
         """Let go of the lock, wait, and take it again; return whether it was notified.
 
-        Parameters
-        ----------
-        timeout_s
-            How long at most, seconds of the clock; None for as long as it takes.
-        idle
-            Whether no thread waits for the work that follows: pacing, or a thread that waits for work. Such a
-            wait alone makes no time pass on a clock that need not go on.
+        ``timeout_s``: seconds of the clock at most; None for as long as it takes. ``idle``: whether no thread
+        waits for the work that follows: pacing, or a thread that waits for work. Such a wait alone makes no
+        time pass on a clock that need not go on.
         """
         ...
 

@@ -118,15 +118,9 @@ class WireAxis:
     A head in memory or a byte simulator decides where the motor goes; counts, units and limits are theirs.
     Safe from any thread.
 
-    Parameters
-    ----------
-    settings
-        Its acceleration is what ``halt`` brakes with. Counts, speed and approach are for ``to_count`` only;
-        the range is not used here.
-    number
-        0 for pan, 1 for tilt: which faults concern it.
-    resumes
-        Whether it goes on to where it was sent when a fault that stopped it is over.
+    The acceleration of ``settings`` is what ``halt`` brakes with. Counts, speed and approach are for
+    ``to_count`` only; the range is not used here. ``number``, 0 for pan, 1 for tilt: which faults concern it.
+    ``resumes``: whether it goes on to where it was sent when a fault that stopped it is over.
     """
 
     def __init__(

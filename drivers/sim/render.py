@@ -9,13 +9,15 @@ A camera's rays are made once: from the model itself, between its exact rays whe
 
 from __future__ import annotations
 
+import logging
 import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -28,6 +30,8 @@ from drivers.sim import kernels
 from drivers.sim.placed import SceneSettings
 from drivers.sim.scene import Scene, build_scene
 from drivers.sim.sensor import FrameExposure, Readout
+
+log = logging.getLogger(__name__)
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -257,8 +261,11 @@ def camera_key(camera: CameraModel) -> tuple[object, ...]:
 def compile_renderer(scene: Scene | None = None) -> None:
     """Compile what drawing a scene needs, or load it from the disk cache; building one does so too.
 
-    Compiling takes some twenty seconds.
+    Compiling takes some twenty seconds, and is logged.
     """
+    folder = cast(Any, kernels.render_tiles).stats.cache_path
+    if folder is None or not any(Path(folder).glob("kernels.render_tiles-*.nbi")):
+        log.info("the simulated rover's renderer is compiled, once: 20 s, longer on a busy machine")
     scene = scene or build_scene(SceneSettings(rocks=1))
     x, y, z = np.eye(3)
     camera = CameraModel("CAHV", (8, 8), C=-1.5 * z, A=x, H=3.5 * x + 8.0 * y, V=3.5 * x + 8.0 * z)

@@ -22,7 +22,6 @@ from typing import Any, get_type_hints
 import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import fft
 
 from calib.geometry.rigid import Rigid, rot_x, rot_y, rot_z
 from drivers.sim import kernels, rocks
@@ -274,6 +273,8 @@ def fractal(
 
     Amplitude falls as frequency ** -falloff between the two wavelengths and is nil outside them.
     """
+    from scipy import fft  # loaded in 0.2 s, and only where a scene is made anew
+
     spectrum = fft.rfft2(rng.standard_normal((size, size), dtype=np.float32))
     fy = fft.fftfreq(size).astype(np.float32)[:, None]
     fx = fft.rfftfreq(size).astype(np.float32)[None, :]

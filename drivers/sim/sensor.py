@@ -13,11 +13,11 @@ import zlib
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
+from statistics import NormalDist
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from drivers.interfaces import Image
 from drivers.sim import kernels
@@ -172,7 +172,8 @@ class AutoExposure:
 @functools.cache
 def bell() -> Float32:
     """Return (65536,) deviates of the normal distribution, each as likely as the others."""
-    return np.asarray(ndtri((np.arange(65536) + 0.5) / 65536), dtype=np.float32)
+    inverse = NormalDist().inv_cdf
+    return np.array([inverse((number + 0.5) / 65536) for number in range(65536)], dtype=np.float32)
 
 
 @dataclass(frozen=True)

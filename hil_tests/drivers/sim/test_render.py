@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import Rigid
+from drivers.sim import kernels
 from drivers.sim.placed import SceneSettings
-from drivers.sim.render import Renderer, Stills, ray_table
+from drivers.sim.render import Renderer, Stills, compile_renderer, ray_table
 from drivers.sim.scene import Scene, kept_scene
 from hil_tests.support import rendered_patches as bias
 
@@ -135,3 +140,25 @@ def test_a_picture_is_drawn_again_as_soon_as_one_bit_differs(
         assert stills.find(*other) is None
         np.testing.assert_array_equal(stills.image(*other), rough.image(*other))
     np.testing.assert_array_equal(first, rough.image(camera, pose, 1))
+
+
+class Kernel:
+    """The compiled function that draws, with a disk cache in another folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.stats = SimpleNamespace(cache_path=str(folder))
+        self._true = kernels.render_tiles
+
+    def __call__(self, *values: Any) -> Any:
+        return self._true(*values)
+
+
+def test_a_compilation_that_takes_long_is_announced_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(kernels, "render_tiles", Kernel(tmp_path))
+    for announced in (1, 1):
+        with caplog.at_level(logging.INFO, "drivers.sim.render"):
+            compile_renderer()
+        assert caplog.text.count("renderer is compiled") == announced
+        (tmp_path / "kernels.render_tiles-1.py311.nbi").touch()
