@@ -132,7 +132,7 @@ class BenchOperation:
 
         The first stop after ``last_stop`` (`LeaseTable.last_stop` at its request; None: that of now) ends the
         worker's right to steer, before the worker itself is ended. ``wanted`` are the fields of
-        `mastctl.web.models.BenchBody`.
+        `mastctl.web.keeping.BenchBody`.
 
         Raises NotNow ``bench_runs``, ``bench_done`` if the run that is to go on has its verdict; NotKnown
         ``bench_unknown``; BadRequest ``bad_board``, ``bad_run``; Unable ``unwritable``, ``disk_low``,

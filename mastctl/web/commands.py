@@ -15,7 +15,7 @@ from typing import Annotated, Any, TypeVar, cast
 
 from fastapi import Depends, FastAPI, Header, Request
 from fastapi.requests import HTTPConnection
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict
 
 from mastctl.control.entry import Answer, Command, CommandRequest
 from mastctl.control.lease import Caller, client_name
@@ -52,6 +52,12 @@ async def _parts(line: HTTPConnection) -> Parts:
 
 
 Here = Annotated[Parts, Depends(_parts)]
+
+
+class StrictQuery(BaseModel):
+    """A query without unknown names; its numbers come as text."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 def stream_of(kind: str) -> dict[int | str, dict[str, Any]]:
@@ -105,9 +111,9 @@ def command(
     ``route`` is method and path below the prefix, ``POST /point``. The function takes the path, the query and
     the body, and ``here`` and ``requested`` (`Requested`) if it needs them; its docstring is the route's
     summary. ``usual_s``, of ``here`` and the function's parameters, is an operation's time without a
-    deadline. ``recorded``, of the function's parameters, is what the command is recorded and recognised by,
-    by default path, query and body.
-    ``beside``: it stops something, so it runs in the stops' own threads, and each try is carried out.
+    deadline; a ``deadline_s`` in the body counts as the header does, the shorter of both. ``recorded``, of
+    the function's parameters, is what the command is recorded and recognised by, by default path, query and
+    body. ``beside``: it stops something, so it runs in the stops' own threads, and each try is carried out.
     """
     method, _, path = route.partition(" ")
 
@@ -122,10 +128,18 @@ def command(
                 for name, one in (("here", here), ("requested", requested))
                 if name in wanted.parameters
             }
+            request.scope["state"]["recorded"] = True  # whatever comes of it
             sent = recorded(**given, **own) if recorded is not None else _request_of(given)
             allowed_s = None if usual_s is None else usual_s(here, **given)
-            work = partial(act, **given, **own)
-            return await carried_out(here, request, kind, requested, sent, work, allowed_s, beside)
+            deadlines_s = [one for one in (requested.deadline_s, sent.get("deadline_s")) if one is not None]
+            requested = replace(requested, request=sent, deadline_s=min(deadlines_s, default=None))
+            if beside:
+                requested = replace(requested, key=None, deadline_s=None)
+
+            def work() -> Mapping[str, Any]:
+                return here.service.entry.run(kind, requested, partial(act, **given, **own), allowed_s)
+
+            return await (stopped(here.service, work) if beside else here.waiting.run(work))
 
         kinds = {"request": Request, "here": Here, "requested": Requested}
         parameters = [Parameter(name, Parameter.KEYWORD_ONLY, annotation=one) for name, one in kinds.items()]
@@ -141,30 +155,6 @@ def command(
         return act
 
     return add
-
-
-async def carried_out(
-    here: Parts,
-    request: Request,
-    kind: Command,
-    requested: CommandRequest,
-    sent: Mapping[str, Any],
-    act: Callable[[], Answer],
-    usual_s: float | None = None,
-    beside: bool = False,
-) -> Answer:
-    """Return the answer of a command, whose refusals are those of `mastctl.control.entry.CommandEntry.run`.
-
-    A ``deadline_s`` in what is ``sent`` counts as the header does, the shorter of both. ``beside``: of the
-    request only the client, the time and the lease are kept.
-    """
-    request.scope["state"]["recorded"] = True  # whatever comes of it
-    deadline_s = _shorter(requested.deadline_s, sent.get("deadline_s"))
-    if beside:
-        requested = replace(requested, key=None)
-        return await stopped(here.service, lambda: here.service.entry.run(kind, requested, act))
-    requested = replace(requested, request=sent, deadline_s=deadline_s)
-    return await here.waiting.run(lambda: here.service.entry.run(kind, requested, act, usual_s))
 
 
 async def stop_first(
@@ -210,7 +200,3 @@ def _request_of(given: Mapping[str, Any]) -> dict[str, Any]:
         elif value is not None:
             sent[name] = value
     return sent
-
-
-def _shorter(one_s: float | None, other_s: float | None) -> float | None:
-    return min((time_s for time_s in (one_s, other_s) if time_s is not None), default=None)

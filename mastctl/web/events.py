@@ -10,30 +10,56 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator, Iterator, Sequence
-from typing import Annotated
+from typing import Annotated, Self, cast
 from weakref import WeakKeyDictionary
 
 from fastapi import FastAPI, Query, WebSocket
 from fastapi.responses import StreamingResponse
+from pydantic import Field, model_validator
 from starlette.requests import HTTPConnection
 from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
 from mastctl.as_json import writable
 from mastctl.control.lease import Caller
-from mastctl.control.publisher import LoopSubscription, Published, Topic
+from mastctl.control.publisher import TOPICS, LoopSubscription, Published, Topic
 from mastctl.http import PREFIX
+from mastctl.motion.requests import Name
 from mastctl.service.service import Service
-from mastctl.web.commands import Here, Parts, stream_of
-from mastctl.web.models import EventsQuery
+from mastctl.web.commands import Here, Parts, StrictQuery, stream_of
 
 EVENTS = f"{PREFIX}/events"
+MOST_KEYS = 16
 ALIVE_S = 2.0  # between signs of life where nothing changes
 GOING_AWAY, UNSUPPORTED, NOT_ALLOWED = 1001, 1003, 1008  # RFC 6455, 7.4.1
 AT_ONCE = 16  # events, in one turn of the event loop
 AGES_HOLD_S = 0.02  # for how long a text that has an age is sent to other listeners too
 AGELESS: frozenset[Topic] = frozenset({"operation", "mast", "command", "bench"})
 """Topics whose values have no age."""
+
+
+class EventsQuery(StrictQuery):
+    """``GET /events``: ``topics`` with commas between, all of them when left out; ``key``: of these only."""
+
+    topics: Annotated[str, Field(max_length=200)] | None = None
+    key: Annotated[list[Name], Field(max_length=MOST_KEYS)] | None = None
+
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        unknown = [name for name in self.names if name not in TOPICS]
+        if unknown:
+            raise ValueError(f"topics: {unknown[0]!r} where some of {', '.join(sorted(TOPICS))} are expected")
+        return self
+
+    @property
+    def names(self) -> tuple[Topic, ...]:
+        """The topics, none for all."""
+        return tuple(cast(Topic, name.strip()) for name in (self.topics or "").split(",") if name.strip())
+
+    @property
+    def keys(self) -> frozenset[str] | None:
+        """The keys, None for all."""
+        return None if self.key is None else frozenset(self.key)
 
 
 def add_events(app: FastAPI) -> None:

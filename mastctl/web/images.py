@@ -12,9 +12,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, Self
 
 from fastapi import FastAPI, Query, Response, WebSocket
+from pydantic import Field, model_validator
 from starlette.websockets import WebSocketDisconnect
 
 from calib.geometry.mode import flip_name
@@ -24,15 +25,53 @@ from mastctl.as_json import as_json
 from mastctl.control.entry import CAMERA_SETTINGS
 from mastctl.frame_facts import described_headers, headers_of
 from mastctl.http import PREFIX
+from mastctl.motion.requests import Name, StrictBody
 from mastctl.report.pictures import encoded
-from mastctl.web.commands import Here, Parts, command, file_of
-from mastctl.web.events import UNSUPPORTED, close_ended, credential_of
-from mastctl.web.models import CameraSettingsBody, ImagesQuery, SnapshotQuery
+from mastctl.web.commands import Here, Parts, StrictQuery, command, file_of
+from mastctl.web.events import MOST_KEYS, UNSUPPORTED, close_ended, credential_of
 from mastctl.web.pictures import Picture, Viewer
 
 IMAGES = f"{PREFIX}/images"
 TIME = "?"
 LONGEST_MESSAGE = 100  # a camera's name, and how large its next image may be
+
+
+class CameraSettingsBody(StrictBody):
+    """``PATCH /cameras/{camera}/settings``: what is to change; one at least."""
+
+    exposure_s: float | None = None
+    gain: float | None = None
+    white_balance_k: float | None = None
+    focus: float | None = None
+
+    @model_validator(mode="after")
+    def _some(self) -> Self:
+        if not self.wanted:
+            raise ValueError(f"one of {', '.join(type(self).model_fields)} at least is expected")
+        return self
+
+    @property
+    def wanted(self) -> dict[str, float]:
+        """The changes, by name."""
+        return self.model_dump(exclude_none=True)
+
+
+class SnapshotQuery(StrictQuery):
+    """``GET /snapshot/{camera}``; ``frame_id`` names a frame that is still kept."""
+
+    format: Literal["png", "jpeg"] = "png"
+    fresh: bool = False
+    frame_id: Name | None = None
+
+
+class ImagesQuery(StrictQuery):
+    """``GET /images``, a WebSocket: of which cameras; whether their first pictures are requested too, and all
+    of them come at the cameras' own rate.
+    """
+
+    camera: Annotated[list[Name], Field(min_length=1, max_length=MOST_KEYS)]
+    on_request: bool = False
+    every: bool = False
 
 
 def add_images(app: FastAPI) -> None:

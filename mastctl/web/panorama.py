@@ -2,23 +2,66 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal, Self
 
-from fastapi import FastAPI, Path, Request
+from fastapi import FastAPI, Path
 from fastapi.responses import FileResponse, Response
+from pydantic import Field, model_validator
 
 from mastctl.answers import PanoramaDrawn, PanoramaList, Started, TargetList
 from mastctl.control.entry import PANORAMA, PANORAMA_DELETE, TARGET_FORGET, TARGET_KEEP
 from mastctl.http import PREFIX
+from mastctl.motion.requests import Angle, Name, Place, StrictBody
 from mastctl.panorama.folder import Index
 from mastctl.service.steering import usual_s
 from mastctl.web.commands import Here, command, file_of
 from mastctl.web.keeping import PlaceName
-from mastctl.web.models import PanoramaBody, TargetBody
 
 Panorama = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]{0,60}$", description="a panorama's id")]
 WAY_S = 60.0
 """A view's move, its pictures, and those taken once more."""
+
+
+class PanoramaBody(StrictBody):
+    """``POST /panoramas``: which field, azimuth and elevation, by which cameras; or what to go on with.
+
+    By default the widest stereo pair, all that the limits let it see, 0.7 rad down to 0.2 rad up.
+    ``exposure``: fixed from the first view on, or each view's own.
+    """
+
+    pair: Name | None = None
+    camera: Name | None = None
+    pan_rad: Annotated[list[Angle], Field(min_length=2, max_length=2)] | None = None
+    tilt_rad: Annotated[list[Angle], Field(min_length=2, max_length=2)] | None = None
+    overlap: Annotated[float, Field(ge=0.05, le=0.8)] = 0.2
+    exposure: Literal["first", "auto-per-view"] = "first"
+    resume: Name | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        if self.pair is not None and self.camera is not None:
+            raise ValueError("pair and camera are both there, one of them is expected")
+        if self.resume is not None and self.model_fields_set - {"resume", "deadline_s"}:
+            raise ValueError("resume goes alone: a panorama goes on as it was begun")
+        return self
+
+
+class TargetBody(StrictBody):
+    """``POST /targets/{name}``: a point of the rover or site frame, and its covariance if it is known.
+
+    Without ``position_m`` the one that ``operation`` measured, a pointing since which the rover stood.
+    """
+
+    position_m: Place | None = None
+    operation: Name | None = None
+    frame: Literal["rover", "site"] = "rover"
+    covariance_m2: Annotated[list[Place], Field(min_length=3, max_length=3)] | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> TargetBody:
+        if (self.position_m is None) == (self.operation is None):
+            raise ValueError("exactly one of position_m and operation is expected")
+        return self
 
 
 def add_panoramas(app: FastAPI) -> None:
@@ -75,9 +118,8 @@ def add_panoramas(app: FastAPI) -> None:
         response_class=FileResponse,
         responses=file_of("application/octet-stream"),
     )
-    async def read(name: Panorama, file: str, request: Request, here: Here) -> FileResponse:
+    async def read(name: Panorama, file: str, here: Here) -> FileResponse:
         path = await here.waiting.run(lambda: here.service.panoramas.file(name, file))
-        request.scope["headers"] = [one for one in request.scope["headers"] if one[0] != b"range"]
         return FileResponse(path, media_type="application/octet-stream", filename=path.name)
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
 import numpy as np
 from fastapi import FastAPI, Path, Query
+from pydantic import Field, model_validator
 
 from calib.errors import BadFile
 from calib.geometry.rigid import FloatArray, Rigid, quaternion_of, rotation_of
@@ -19,9 +20,9 @@ from mastctl.as_json import as_json
 from mastctl.control import entry
 from mastctl.errors import BadRequest, NoLonger, NotKnown, NotNow
 from mastctl.http import PREFIX
+from mastctl.motion.requests import LARGEST_M, LARGEST_PX, Angle, Metres, Name, Place, StrictBody
 from mastctl.service.service import Service
-from mastctl.web.commands import Here, command
-from mastctl.web.models import BoardBody, FaultBody, FaultsQuery, StandBody, TimeBody, TruthQuery
+from mastctl.web.commands import Here, StrictQuery, command
 
 if TYPE_CHECKING:
     from drivers.sim.bench_boards import BenchBoard
@@ -34,6 +35,102 @@ BoardName = Annotated[
         description="1 to 40 letters a to z, digits, '_' and '-', the first a letter or digit,",
     ),
 ]
+
+Slope = Annotated[float, Field(ge=-1.0, le=1.0)]
+Turn = Annotated[float, Field(ge=-1e9, le=1e9)]
+QueryPixel = Annotated[float, Field(ge=-LARGEST_PX, le=LARGEST_PX)]
+QueryMetres = Annotated[float, Field(ge=-LARGEST_M, le=LARGEST_M)]
+
+
+class StandBody(StrictBody):
+    """``POST /simulation/pose``: where the simulated rover truly stands on its ground."""
+
+    x_m: Metres
+    y_m: Metres
+    heading_rad: Angle
+    pitch_rad: Slope = 0.0
+    roll_rad: Slope = 0.0
+
+
+class BoardBody(StrictBody):
+    """``POST /simulation/boards/{name}``: where a board is held up before a simulated rover.
+
+    ``board`` holds what a BOARD.yaml does (its ``schema`` may be left out); without it a board of this name
+    is moved that is there already. The place is in the rover frame as the rover stands now. Without
+    ``quaternion`` (w, x, y, z; rover_from_board) it faces the mast upright and is then turned about its own
+    x, y and z.
+    """
+
+    position_m: Place
+    board: dict[str, Any] | None = None
+    turned_rad: Annotated[list[Angle], Field(min_length=3, max_length=3)] | None = None
+    quaternion: Annotated[list[Turn], Field(min_length=4, max_length=4)] | None = None
+    bow_m: Annotated[list[Metres], Field(min_length=2, max_length=2)] | None = None
+
+    @model_validator(mode="after")
+    def _one_turn(self) -> BoardBody:
+        if self.turned_rad is not None and self.quaternion is not None:
+            raise ValueError("quaternion and turned_rad are both there, one of them is expected")
+        if self.quaternion is not None and float(np.linalg.norm(self.quaternion)) < 1e-6:
+            raise ValueError(f"quaternion: {self.quaternion} where one that is not zero is expected")
+        return self
+
+
+class TimeBody(StrictBody):
+    """``POST /simulation/time``: let time pass where it does not pass by itself."""
+
+    advance_s: Annotated[float, Field(ge=0.0, le=3600.0)]
+
+
+class FaultBody(StrictBody):
+    """``POST /simulation/faults``: a fault word for a simulated device, with its parameters."""
+
+    device: Name
+    word: Name
+    parameters: dict[str, float] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _free_names(self) -> FaultBody:
+        for name in ("device", "word", "self"):
+            if name in self.parameters:
+                raise ValueError(f"parameters.{name}: unknown key; no fault has a parameter of this name")
+        return self
+
+
+class TruthQuery(StrictQuery):
+    """``GET /simulation/truth``: a frame, and a pixel of it or a point of the site, metres."""
+
+    frame_id: Name
+    x_px: QueryPixel | None = None
+    y_px: QueryPixel | None = None
+    x_m: QueryMetres | None = None
+    y_m: QueryMetres | None = None
+    z_m: QueryMetres | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        given = {name for name in ("x_px", "y_px", "x_m", "y_m", "z_m") if getattr(self, name) is not None}
+        if given not in ({"x_px", "y_px"}, {"x_m", "y_m", "z_m"}):
+            raise ValueError("x_px and y_px, or x_m, y_m and z_m, are expected, and not both")
+        return self
+
+    @property
+    def pixel_px(self) -> tuple[float, float] | None:
+        """The pixel, None where a point was given."""
+        return None if self.x_px is None or self.y_px is None else (self.x_px, self.y_px)
+
+    @property
+    def position_in_site_m(self) -> tuple[float, float, float] | None:
+        """The point, None where a pixel was given."""
+        if self.x_m is None or self.y_m is None or self.z_m is None:
+            return None
+        return self.x_m, self.y_m, self.z_m
+
+
+class FaultsQuery(StrictQuery):
+    """``DELETE /simulation/faults``; without a device all faults are taken back."""
+
+    device: Name | None = None
 
 
 def add_simulation(app: FastAPI) -> None:

@@ -5,38 +5,163 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
+import math
 import threading
 from functools import partial
-from typing import Any
+from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from fastapi import FastAPI, Request
+from pydantic import BaseModel, Field, StringConstraints, model_validator
 
+from calib.geometry.rigid import Rigid, rotation_of
 from mastctl import answers
 from mastctl.control import entry
 from mastctl.control.entry import CommandRequest
-from mastctl.control.lease import Lease, LeaseTable, client_name
+from mastctl.control.lease import LONGEST_S, SHORTEST_S, USUAL_S, Lease, LeaseTable, client_name
+from mastctl.devices.judge import LEAST_CONE_RAD, WIDEST_CONE_RAD, SunDirection, direction_of
 from mastctl.errors import BadRequest, NotNow, Unable, one_line
 from mastctl.http import PREFIX
 from mastctl.motion.jog import JogBeat
-from mastctl.motion.requests import PointingError, PointRequest, TrackRequest
+from mastctl.motion.requests import (
+    LARGEST_M,
+    Angle,
+    Name,
+    Place,
+    PointingError,
+    PointRequest,
+    StrictBody,
+    TrackRequest,
+)
+from mastctl.motion.track import RoverPose
 from mastctl.safety.latch import LONGEST
 from mastctl.service.service import Service
 from mastctl.service.steering import usual_s
 from mastctl.service.stopping import StopsHang
-from mastctl.web.commands import Here, Parts, Requested, carried_out, command, stop_first
-from mastctl.web.models import (
-    EstopBody,
-    LeaseBody,
-    PoseBody,
-    RenewBody,
-    ResetBody,
-    SunBody,
-    TakeBody,
-)
+from mastctl.web.commands import Here, Parts, Requested, command, stop_first
 
 BODY_S = 0.02  # how long an emergency stop waits for a reason that did not come with its request
 LARGEST_BODY_BYTES = 4096
-ANY_BODY = {"anyOf": [EstopBody.model_json_schema(), {}]}  # a stop is refused for no body
+
+Person = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=LONGEST)]
+Sigma = Annotated[float, Field(ge=0.0, le=LARGEST_M)]
+Part = Annotated[float, Field(ge=-1e9, le=1e9)]
+LeaseS = Annotated[float, Field(ge=SHORTEST_S, le=LONGEST_S)]
+CovarianceRow = Annotated[list[Part], Field(min_length=6, max_length=6)]
+
+
+class EstopBody(BaseModel):
+    """``POST /estop``: why and by whom, if they are given."""
+
+    reason: str | None = None
+    name: str | None = None
+
+
+class ResetBody(StrictBody):
+    """``POST /reset``: why and by whom the stop is released."""
+
+    reason: Person
+    name: Person
+
+
+class LeaseBody(StrictBody):
+    """``POST /lease``: how long, and whose it is, if not the caller's.
+
+    ``ends_with_stop``: it ends with the next stop of the head.
+    """
+
+    name: Name | None = None
+    for_s: LeaseS = USUAL_S
+    ends_with_stop: bool = False
+
+
+class RenewBody(StrictBody):
+    """``POST /lease/renew``: how long from now on; as long as at first when left out."""
+
+    for_s: LeaseS | None = None
+
+
+class TakeBody(LeaseBody):
+    """``POST /lease/take``: why, beside what goes with a lease."""
+
+    reason: Person
+
+
+class SigmaBody(StrictBody):
+    """One sigma of each axis of a motion: of its translation, metres, and of its rotation, radians."""
+
+    position_m: Sigma
+    rotation_rad: Annotated[float, Field(ge=0.0, le=math.pi)]
+
+
+class PoseBody(StrictBody):
+    """``POST /pose``: site_from_rover, and how well the motion since the pose before is known.
+
+    ``covariance`` (6, 6) has the order x, y, z, turn about x, about y, about z: metres and radians along the
+    rover's axes of this pose.
+    """
+
+    position_m: Place
+    quaternion: Annotated[list[Part], Field(min_length=4, max_length=4)]
+    covariance: Annotated[list[CovarianceRow], Field(min_length=6, max_length=6)] | None = None
+    sigma: SigmaBody | None = None
+    time_s: Annotated[float, Field(ge=-1e12, le=1e12)] | None = None
+    look: bool = True
+
+    @model_validator(mode="after")
+    def _sound(self) -> Self:
+        length = math.hypot(*self.quaternion)
+        if abs(length - 1.0) > 1e-3:
+            raise ValueError(f"quaternion (w, x, y, z) has the length {length:g} where 1 is expected")
+        if self.covariance is not None and self.sigma is not None:
+            raise ValueError("covariance and sigma say the same; one of them is expected")
+        if self.covariance is not None:
+            _check_covariance(self.covariance)
+        return self
+
+    def pose(self, received_s: float) -> RoverPose:
+        """Return it as the tracker takes it."""
+        covariance = None
+        if self.covariance is not None:
+            order = [3, 4, 5, 0, 1, 2]  # rotation first, as calib.matching.track has it
+            covariance = np.array(self.covariance)[np.ix_(order, order)]
+        elif self.sigma is not None:
+            covariance = np.diag([self.sigma.rotation_rad**2] * 3 + [self.sigma.position_m**2] * 3)
+        frame = Rigid(rotation_of(self.quaternion), np.array(self.position_m))
+        return RoverPose(frame, covariance, self.time_s, received_s)
+
+
+def _check_covariance(rows: list[list[float]]) -> None:
+    """Pass a matrix that can be a covariance. Raises ValueError."""
+    matrix = np.array(rows)
+    # Each axis by its own sigma: a large one in metres hides nothing that is wrong with a small one.
+    sigma = np.sqrt(np.abs(np.diag(matrix)))
+    sigma[sigma == 0] = 1.0
+    correlation = matrix / sigma / sigma[:, None]
+    if not np.abs(correlation - correlation.T).max() <= 1e-6:
+        raise ValueError("covariance is not symmetric")
+    if np.linalg.eigvalsh(correlation)[0] < -1e-6:
+        raise ValueError("covariance has a negative variance in some direction")
+
+
+class SunBody(StrictBody):
+    """``POST /limits/sun``: a direction by azimuth and elevation, and the cone around it.
+
+    Azimuth goes from x over y, elevation up; in the site frame x is north and y east, in the rover's forward
+    and right. ``valid_s`` is how long it holds; left out: until another is given.
+    """
+
+    azimuth_rad: Angle
+    elevation_rad: Annotated[float, Field(ge=-math.pi / 2, le=math.pi / 2)]
+    frame: Literal["site", "rover"] = "site"
+    half_angle_rad: Annotated[float, Field(ge=LEAST_CONE_RAD, le=WIDEST_CONE_RAD)]
+    valid_s: Annotated[float, Field(gt=0.0, le=1e6)] | None = None
+
+    def sun(self, now_s: float) -> SunDirection:
+        """Return it as the judge of moves takes it."""
+        until_s = None if self.valid_s is None else now_s + self.valid_s
+        direction = direction_of(self.azimuth_rad, self.elevation_rad)
+        return SunDirection(direction, self.frame, self.half_angle_rad, until_s)
 
 
 def add_pointing(app: FastAPI) -> None:
@@ -89,18 +214,10 @@ def add_pointing(app: FastAPI) -> None:
     async def operation(operation_id: str, here: Here) -> answers.OperationAnswer:
         return here.service.operations.get(operation_id).as_json()
 
-    @app.post(
-        f"{PREFIX}/operations/{{operation_id}}/stop",
-        summary="Stop the mast and one operation, if it still runs; what another client began goes on",
-    )
-    async def stop_one(
-        operation_id: str, request: Request, here: Here, requested: Requested
-    ) -> answers.OperationAnswer:
-        def act() -> dict[str, Any]:  # no id: it begins nothing
-            here.service.operations.stop_one(operation_id)
-            return {}
-
-        await carried_out(here, request, entry.OPERATION_STOP, requested, {}, act, beside=True)
+    @command(app, "POST /operations/{operation_id}/stop", entry.OPERATION_STOP, beside=True)
+    def stop_one(operation_id: str, here: Here) -> answers.OperationAnswer:
+        """Stop the mast and one operation, if it still runs; what another client began goes on."""
+        here.service.operations.stop_one(operation_id)
         return here.service.operations.get(operation_id).as_json()
 
     @app.post(f"{PREFIX}/stop", summary="Stop the mast and the running operation, at once")
@@ -110,11 +227,12 @@ def add_pointing(app: FastAPI) -> None:
 
 def add_estop(app: FastAPI) -> None:
     """The emergency stop, which needs no body that makes sense, and the reset, which does."""
+    any_body = {"anyOf": [EstopBody.model_json_schema(), {}]}  # a stop is refused for no body
 
     @app.post(
         f"{PREFIX}/estop",
         summary="Stop the mast and let nothing move it until it is reset, across restarts too",
-        openapi_extra={"requestBody": {"content": {"application/json": {"schema": ANY_BODY}}}},
+        openapi_extra={"requestBody": {"content": {"application/json": {"schema": any_body}}}},
     )
     async def estop(request: Request, here: Here) -> answers.EstopAnswer:
         stopping = here.service.stopping
@@ -178,13 +296,10 @@ def add_tracking(app: FastAPI) -> None:
         """Look for the target once more."""
         return {"id": here.service.steering.look().id}
 
-    @app.post(f"{PREFIX}/track/stop", summary="End the track; the head stops if it moves for it")
-    async def stop(request: Request, here: Here, requested: Requested) -> answers.TrackAnswer:
-        def act() -> dict[str, Any]:  # no id: it begins nothing
-            here.service.stopping.stop_track()
-            return {}
-
-        await carried_out(here, request, entry.TRACK_STOP, requested, {}, act, beside=True)
+    @command(app, "POST /track/stop", entry.TRACK_STOP, beside=True)
+    def stop(here: Here) -> answers.TrackAnswer:
+        """End the track; the head stops if it moves for it."""
+        here.service.stopping.stop_track()
         return here.service.track_answer()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import socket
 import threading
 from collections.abc import Callable, Iterator
@@ -127,7 +128,7 @@ def test_a_lease_in_use_is_renewed_and_released_at_the_end(bench: Client, pair: 
 @pytest.mark.parametrize(
     ("path", "body"),
     [
-        ("/limits/sun", {"direction": [-1, 0, 0], "frame": "rover", "half_angle_rad": 0.1}),
+        ("/limits/sun", {"azimuth_rad": math.pi, "elevation_rad": 0.0, "half_angle_rad": 0.1}),
         ("/pose", {"position_m": [0, 0, 0], "quaternion": [1, 0, 0, 0]}),
     ],
 )
