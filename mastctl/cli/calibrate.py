@@ -325,8 +325,8 @@ def _bench(args: argparse.Namespace) -> Answer:
 def _again(args: argparse.Namespace) -> Answer:
     from calib.files.mast_file import load_rig
     from calib.survey.reader import read_survey
-    from mastctl.bench.result import fit_again
     from mastctl.bench.survey import former_rig
+    from mastctl.bench.worker import fit_again
 
     seen = args.folder / "seen"
     folder = seen if seen.is_dir() else args.folder
@@ -451,7 +451,7 @@ def _watched(client: Client) -> BenchRunRecord:
 
 
 def _progress(run: BenchRunRecord) -> str:
-    from mastctl.bench.result import px
+    from mastctl.bench.worker import px
 
     seen = ", ".join(
         f"{name} {100 * sum(map(bool, image['cells'])) / len(image['cells']):.0f} %"
