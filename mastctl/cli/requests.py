@@ -311,61 +311,20 @@ def _reference(args: argparse.Namespace) -> Answer:
 
 @command(
     "rig sentinel look",
+    option("--idle-s S", "how long the head must have been idle (default: 0)", default=0.0),
     FOLDER,
     *DAEMON,
     help="take them again and report changes; 1 if there is one",
     example="--folder sentinel",
 )
 def _look(args: argparse.Namespace) -> Answer:
-    from mastctl.drift.looks import look_again, steering
-    from mastctl.drift.pictures import add_look, read_reference
-
-    reference = read_reference(args.folder)
-    with (
-        client_of(args) as client,
-        steering(client, args.lease),
-        output.waiting(args.json, f"comparing {len(reference.rests)} poses"),
-    ):
-        drift = look_again(client, reference)
-    return _standing(args, add_look(args.folder, reference, drift))
-
-
-def _standing(args: argparse.Namespace, look: dict[str, Any] | None) -> Answer:
+    from mastctl.drift.looks import look
     from mastctl.drift.pictures import read_looks, read_reference, standing
 
+    with client_of(args) as client, output.waiting(args.json, "taking the reference images again"):
+        line = look(client, args.folder, args.lease, args.idle_s)
     reference = read_reference(args.folder)
     now = standing(reference, read_looks(args.folder, reference))
-    document = {name: now[name] for name in ("level", "sentence", "since", "looks")} | {"look": look}
-    missing = [f"{place}: no image: {reason}" for place, reason in (look or {}).get("missing", {}).items()]
+    document = {name: now[name] for name in ("level", "sentence", "since", "looks")} | {"look": line}
+    missing = [f"{place}: no image: {reason}" for place, reason in line["missing"].items()]
     return Answer(document, [now["sentence"], *missing], 1 if now["level"] == "bad" else 0)
-
-
-@command(
-    "rig sentinel watch",
-    option(
-        "--every-s S", "how often, from the reference's time of day on (default: once a day)", default=86400.0
-    ),
-    option("--idle-s S", "how long the head must have been idle", default=300.0),
-    FOLDER,
-    *DAEMON,
-    help="look again and again, whenever the head is idle, until Ctrl-C",
-    example="--folder sentinel --every-s 86400",
-)
-def _watch(args: argparse.Namespace) -> int:
-    from mastctl.drift.looks import watch
-
-    def report(look: dict[str, Any]) -> None:
-        output.show(args, _standing(args, look))
-
-    watch(args.folder, lambda: client_of(args), output.tell, report, args.every_s, args.idle_s)
-    return 0
-
-
-@command(
-    "rig sentinel status",
-    FOLDER,
-    help="the result of the looks so far; 1 if something has changed",
-    example="--folder sentinel",
-)
-def _status(args: argparse.Namespace) -> Answer:
-    return _standing(args, None)

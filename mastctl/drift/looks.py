@@ -1,31 +1,27 @@
-"""Going to the rests of a reference and taking its images again, once, or whenever the head is idle."""
+"""Going to the rests of a reference and taking its images again, through the daemon."""
 
 from __future__ import annotations
 
-import math
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from calib.calibrate.drift import JOINT_SIGMA_RAD, SceneDrift, ViewShift, find_drift, seen_again
-from calib.errors import BadFile
 from calib.files.mast_file import parse_rig
 from calib.geometry.rig import Rig
 from calib.matching.warp import grey
 from mastctl.client import Client, ClientError
-from mastctl.drift.pictures import Reference, ReferencePicture, add_look, read_looks, read_reference
+from mastctl.drift.pictures import Reference, ReferencePicture, add_look, read_reference
 from mastctl.errors import MastctlError
 
 TURN_TIMEOUT_S = 90.0
 EDGE_RAD = 0.05
 TILTS_RAD = (-0.2, -0.5)
-IDLE = "ready"
+LEASE_S = 30.0
 NOT_THE_CAMERA = frozenset({"lease_over", "lease_unknown", "leased", "no_daemon", "closing"})
 """What a snapshot is refused with where no other camera would do better."""
 
@@ -44,18 +40,6 @@ def usual_rests(client: Client) -> list[tuple[float, float]]:
     pans = [low + (high - low) * part for part in (1 / 6, 1 / 2, 5 / 6)]
     tilts = [min(max(tilt, down + EDGE_RAD), up - EDGE_RAD) for tilt in TILTS_RAD]
     return [(pan, tilt) for tilt in dict.fromkeys(tilts) for pan in pans]
-
-
-def _in_use(client: Client, for_s: float) -> str:
-    """Why the head is in use, '' if it is idle and was not used for some seconds."""
-    if (control := client.control()) is not None:
-        return f"{control['holder']} steers"
-    status = client.status()
-    state, reason = status["state"], status["reason"]
-    if state != IDLE:
-        return f"the daemon's state is {state}" + (f" ({reason})" if reason else "")
-    since_s = float(status["state_for_s"])
-    return "" if since_s >= for_s else f"the head was used {since_s:.0f} s ago; {for_s:.0f} s are waited for"
 
 
 def take_pictures(
@@ -173,13 +157,6 @@ def _reported_px(rig: Rig, then: ReferencePicture, now: ReferencePicture, pixels
     return np.asarray(np.where(valid[:, None], seen - pixels, 0.0))
 
 
-LEASE_S = 30.0
-RETRY_S = 60.0
-"""After so long it is tried again, where a look is due and a client needs the head."""
-
-NAME = "sentinel"
-
-
 @contextmanager
 def steering(client: Client, lease: str | None = None) -> Iterator[None]:
     """Steer alone: under a lease that was named, or one of its own, which ends with a stop of the head.
@@ -190,7 +167,7 @@ def steering(client: Client, lease: str | None = None) -> Iterator[None]:
         yield
         return
     try:
-        with client.lease(NAME, for_s=LEASE_S, ends_with_stop=True):
+        with client.lease("sentinel", for_s=LEASE_S, ends_with_stop=True):
             yield
     except ClientError as error:
         if error.code not in ("lease_over", "leased"):
@@ -199,51 +176,20 @@ def steering(client: Client, lease: str | None = None) -> Iterator[None]:
         raise LookEnded(f"{how}; nothing was kept") from None
 
 
-def is_due(reference: Reference, last_look: str | None, every_s: float, now: datetime) -> bool:
-    """Return whether a look is due: at the reference's time of day, and each ``every_s`` from it on.
+def look(client: Client, folder: Path, lease: str | None = None, idle_s: float = 0.0) -> dict[str, Any]:
+    """Take the images of a folder's reference again, and return the line of the look that is kept.
 
-    What a clock that was set back makes of it is a look too many, not none for as long.
+    Raises LookEnded if the head is in use, or was within the last ``idle_s`` seconds, and where a look ends
+    early; BadFile without a reference.
     """
-
-    def turn(moment: datetime) -> int:
-        passed = moment - datetime.fromisoformat(reference.time).astimezone(UTC)
-        return math.floor(passed.total_seconds() / every_s)
-
-    last = reference.time if last_look is None else last_look
-    return turn(now) != turn(datetime.fromisoformat(last).astimezone(UTC))
-
-
-def watch(
-    folder: Path,
-    connect: Callable[[], AbstractContextManager[Client]],
-    put_off: Callable[[str], None],
-    looked: Callable[[dict[str, Any]], None],
-    every_s: float,
-    idle_s: float,
-    sleep: Callable[[float], None] = time.sleep,
-) -> None:
-    """Compare every ``every_s`` seconds if the head was not used for ``idle_s``, until interrupted.
-
-    ``put_off`` gets why nothing is done though it is due, each reason once; ``looked`` gets each result.
-    Raises BadFile if there is no reference at the start; what fails later is reported, and tried again.
-    """
-    read_reference(folder)
-    reported = ""
-    while True:
-        reason = ""
-        try:
-            reference = read_reference(folder)
-            looks = read_looks(folder, reference)
-            if is_due(reference, looks[-1]["time"] if looks else None, every_s, datetime.now(UTC)):
-                with connect() as client:
-                    reason = _in_use(client, idle_s)
-                    if not reason:
-                        with steering(client):
-                            drift = look_again(client, reference)
-                        looked(add_look(folder, reference, drift))
-        except (ClientError, MastctlError, BadFile) as error:
-            reason = str(error)
-        if reason and reason != reported:
-            put_off(f"no look now: {reason}")
-        reported = reason
-        sleep(min(RETRY_S, every_s / 4.0))
+    reference = read_reference(folder)
+    status = client.status()
+    state, reason, rested_s = status["state"], status["reason"], float(status["state_for_s"])
+    if state != "ready":
+        reason = f" ({reason})" if reason else ""
+        raise LookEnded(f"no look now: the daemon's state is {state}{reason}, and ready is expected")
+    if rested_s < idle_s:
+        raise LookEnded(f"no look now: the head was used {rested_s:.0f} s ago; {idle_s:.0f} s are waited for")
+    with steering(client, lease):
+        drift = look_again(client, reference)
+    return add_look(folder, reference, drift)

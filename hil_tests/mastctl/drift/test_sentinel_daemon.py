@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from hil_tests.waiting import until
 from mastctl.cli.main import main
 from mastctl.client import Client
 from mastctl.daemon import RunningDaemon
-from mastctl.drift.looks import watch
+from mastctl.drift.looks import LookEnded, look
 from mastctl.drift.pictures import LOOKS, REFERENCE, read_looks, read_reference
 
 Run = Callable[..., tuple[int, str, str]]
@@ -44,8 +43,7 @@ def folder(daemon: RunningDaemon) -> Path:
 def run(daemon: RunningDaemon, folder: Path, capsys: pytest.CaptureFixture[str]) -> Run:
     def call(*words: str, where: Path = folder) -> tuple[int, str, str]:
         capsys.readouterr()
-        asks = () if words[0] == "status" else ("--url", daemon.url)
-        code = main(["rig", "sentinel", *words, "--folder", str(where), *asks])
+        code = main(["rig", "sentinel", *words, "--folder", str(where), "--url", daemon.url])
         out, log = capsys.readouterr()
         return code, out.strip(), log.strip()
 
@@ -158,46 +156,33 @@ class Meddling(Client):
         return super().snapshot(*words, **options)
 
 
-class Over(Exception):
-    pass
+def looked(daemon: RunningDaemon, folder: Path, meddle: Callable[[], object], idle_s: float = 0.0) -> str:
+    """A look with another client in the middle: why it ended, empty for one that is kept."""
+    with Meddling(daemon.url, meddle) as client:
+        try:
+            look(client, folder, idle_s=idle_s)
+        except LookEnded as ended:
+            return str(ended)
+    return ""
 
 
-def watched(daemon: RunningDaemon, folder: Path, meddle: Callable[[], object]) -> list[str]:
-    """One turn of a watch that is due, with another client in the middle; what it reported."""
-    reports: list[str] = []
-
-    @contextmanager
-    def connect() -> Iterator[Client]:
-        with Meddling(daemon.url, meddle) as client:
-            yield client
-
-    def sleep(_s: float) -> None:
-        raise Over
-
-    with pytest.raises(Over):
-        looked = lambda result: reports.append(f"looked: {result['views']}")  # noqa: E731
-        watch(folder, connect, reports.append, looked, 1e-3, 0.0, sleep)
-    return reports
-
-
-def test_a_watch_looks_while_no_client_steers_and_lets_go_of_the_head(
+def test_a_look_lets_go_of_the_head_and_waits_for_one_that_is_in_use(
     daemon: RunningDaemon, folder: Path, client: Client
 ) -> None:
-    assert watched(daemon, folder, lambda: None) == ["looked: 6"]
+    assert looked(daemon, folder, lambda: None) == ""
     assert client.control() is None
+    assert looked(daemon, folder, lambda: None, 3600.0).endswith("s ago; 3600 s are waited for")
     assert len(read_looks(folder, read_reference(folder))) == 1
 
 
-def test_a_watch_ends_where_another_takes_over_and_starts_no_look_meanwhile(
+def test_a_look_ends_where_another_takes_over_and_none_begins_meanwhile(
     daemon: RunningDaemon, folder: Path, client: Client
 ) -> None:
     lease = []
-    reports = watched(
-        daemon, folder, lambda: lease.append(client.acquire_lease(for_s=60.0, take_over="mine"))
-    )
-    assert reports == ["no look now: ana took over: mine; nothing was kept"]
+    meddle = lambda: lease.append(client.acquire_lease(for_s=60.0, take_over="mine"))  # noqa: E731
+    assert looked(daemon, folder, meddle) == "ana took over: mine; nothing was kept"
     last = [one["id"] for one in client.operations()]
-    assert watched(daemon, folder, lambda: None) == ["no look now: ana steers"]
+    assert "ana" in looked(daemon, folder, lambda: None)
     assert [one["id"] for one in client.operations()] == last
     client.use_lease(lease[0]["lease_id"])
     client.release_lease()
@@ -205,7 +190,7 @@ def test_a_watch_ends_where_another_takes_over_and_starts_no_look_meanwhile(
 
 
 @pytest.mark.parametrize("stop", ["stop", "estop"])
-def test_after_a_stop_in_the_middle_a_watch_moves_nothing_more(
+def test_after_a_stop_in_the_middle_looks_move_nothing_more(
     stop: str, daemon: RunningDaemon, folder: Path, client: Client
 ) -> None:
     at: list[tuple[float, float]] = []
@@ -215,11 +200,9 @@ def test_after_a_stop_in_the_middle_a_watch_moves_nothing_more(
         getattr(client, stop)()
         at.append(stands(client))
 
-    reports = watched(daemon, folder, press)
     by = {"stop": "ana", "estop": "an emergency stop (ana)"}[stop]
-    assert reports == [f"no look now: the head was stopped by {by}; nothing was kept"]
+    assert looked(daemon, folder, press) == f"the head was stopped by {by}; nothing was kept"
     assert stands(client) == at[0]
-    (said,) = watched(daemon, folder, lambda: None)
     state = {"stop": "holding", "estop": "stopped"}[stop]
-    assert said.startswith(f"no look now: the daemon's state is {state}")
+    assert looked(daemon, folder, lambda: None).startswith(f"no look now: the daemon's state is {state}")
     assert stands(client) == at[0]
