@@ -30,7 +30,6 @@ CHEAP = [
     "tools.campaigns.handoff --cases 2 --good 1",
     "tools.campaigns.provocations survey --cases 3",
     "tools.campaigns.provocations bench --only ids",
-    "tools.campaigns.refine --rig configs/sim/rocky8.yaml --cases 1",
     "tools.campaigns.residuals --cases 1 --day kind",
     "tools.campaigns.sweep joints --cases 1 --distances 2",
     "tools.flight.real_handoff hil_tests/data/mer_navcam",

@@ -13,8 +13,7 @@ import pytest
 from tools.command import end
 
 CASES = {
-    "campaigns.refine --rig /nosuch": "/nosuch: cannot be read: No such file or directory",
-    "campaigns.refine --rig /nosuch --click-px 0": "--click-px: '0' where a number above zero is expected",
+    "against_others.spheres /nosuch": "/nosuch/index.yaml: cannot be read: No such file or directory",
     "campaigns.handoff --cases 0": "--cases: '0' where a whole number of at least 1 is expected",
     "campaigns.provocations survey --cases 0": "--cases: '0' where a whole number of at least 1 is expected",
     "benchmarks.daemon start --rounds 0": "--rounds: '0' where a whole number of at least 1 is expected",

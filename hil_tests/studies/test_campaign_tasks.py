@@ -8,8 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from hil_tests.mastctl.calibration.survey_world import RIG_FILE
-
 
 def run(repository: Path, *words: str) -> str:
     """What a campaign prints on stdout, but for times."""
@@ -20,5 +18,5 @@ def run(repository: Path, *words: str) -> str:
 
 @pytest.mark.long(2, "two processes; test_tasks.py compares them with a cluster in the quick run")
 def test_a_campaign_prints_the_same_of_one_process_and_of_two(repository: Path) -> None:
-    campaign = ("tools.campaigns.refine", "--rig", str(RIG_FILE), "--cases", "1", "--handoffs", "8")
+    campaign = ("tools.campaigns.handoff", "--cases", "2", "--good", "1")
     assert run(repository, *campaign, "--workers", "2") == run(repository, *campaign, "--workers", "1")

@@ -71,7 +71,8 @@ def by_pannellum(folder: Folder, files: Path, pannellum: Path) -> FloatArray:
     width, height = SIZE_PX
     middle_rad, off = canvas.azimuth_rad + (canvas.size_px[0] - 1) / 2.0 / canvas.px_per_rad, []
     u, v = np.meshgrid(np.arange(width) - (width - 1) / 2.0, np.arange(height) - (height - 1) / 2.0)
-    window = cv2.createHanningWindow((PART_PX, PART_PX), cv2.CV_32F)
+    correlate: Any = cv2.phaseCorrelate
+    window: Any = cv2.createHanningWindow((PART_PX, PART_PX), cv2.CV_32F)
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=chromium(), args=WEBGL)
         page = browser.new_page(viewport={"width": width, "height": height})
@@ -86,11 +87,13 @@ def by_pannellum(folder: Folder, files: Path, pannellum: Path) -> FloatArray:
             level = rays @ cv2.Rodrigues(np.array([0.0, seen[1], 0.0]))[0].T
             local = level @ cv2.Rodrigues(np.array([0.0, 0.0, seen[0] + middle_rad]))[0].T
             places = canvas.pixels(canvas.rover_from_mosaic.vectors(local)).astype(np.float32)
-            ours = cv2.remap(mosaic, places[..., 0], places[..., 1], cv2.INTER_LINEAR)
+            ours: Any = cv2.remap(mosaic, places[..., 0], places[..., 1], cv2.INTER_LINEAR)
             ours = ours if ours.ndim == 2 else cv2.cvtColor(ours, cv2.COLOR_BGR2GRAY)
             for x, y in itertools.product(range(60, width - 200, 150), range(60, height - 200, 120)):
-                part = np.s_[y : y + PART_PX, x : x + PART_PX]
-                shift, response = cv2.phaseCorrelate(np.float32(shown[part]), np.float32(ours[part]), window)
+                part: Any = np.s_[y : y + PART_PX, x : x + PART_PX]
+                shift, response = cv2.phaseCorrelate(
+                    *(one[part].astype(np.float32) for one in (shown, ours)), window
+                )
                 if response > 0.5:
                     off.append(shift)
         browser.close()
