@@ -91,9 +91,8 @@ def by_pannellum(folder: Folder, files: Path, pannellum: Path) -> FloatArray:
             ours = ours if ours.ndim == 2 else cv2.cvtColor(ours, cv2.COLOR_BGR2GRAY)
             for x, y in itertools.product(range(60, width - 200, 150), range(60, height - 200, 120)):
                 part: Any = np.s_[y : y + PART_PX, x : x + PART_PX]
-                shift, response = cv2.phaseCorrelate(
-                    *(one[part].astype(np.float32) for one in (shown, ours)), window
-                )
+                pair = np.float32(shown[part]), np.float32(ours[part])
+                shift, response = correlate(*pair, window)
                 if response > 0.5:
                     off.append(shift)
         browser.close()
