@@ -76,21 +76,13 @@ MODELS = (
     option("SURVEY", "the survey folder; with --refine the mast file"),
     option(
         "--refine HANDOFFS.jsonl",
-        "record of hand-offs to correct the body cameras by; may be given several times",
+        "record of hand-offs to correct the body cameras by; may be repeated",
         repeat=True,
     ),
     option("--out MAST.yaml", "the mast file to write", required=True),
     option("--report DIR", "folder for calibration.html"),
-    option(
-        "--method paper|joint",
-        "paper: cameras first, then the mast; joint (default): everything together, weighted",
-    ),
-    option(
-        "--mast 4|6|8",
-        "mast parameters: 4 upright, 6 the paper's (default), 8 two skew axes",
-        type=int,
-        choices=(4, 6, 8),
-    ),
+    option("--method paper|joint", "paper: cameras first; joint (default): all together, weighted"),
+    option("--mast 4|6|8", "mast parameters: 4 upright, 6 as in the paper (default), 8 two skew axes"),
     *MODELS,
     option("--in-use MAST.yaml", "the mast file to compare with (default: what --out was before)"),
     example="survey --out mast.yaml --report report",
@@ -279,9 +271,7 @@ def _verdict(document: Mapping[str, Any]) -> Iterator[str]:
     option("--out MAST.yaml", "the mast file to write", required=True),
     option("--report DIR", "folder for bench.html"),
     option("--pictures N", "of each camera, at most", type=at_least(12), default=60),
-    option(
-        "--wanted-px PX", "wanted error of a first pointing from the calibration, rms an axis", default=0.2
-    ),
+    option("--wanted-px PX", "wanted error of a first pointing by the calibration alone, rms", default=0.2),
     option("--by-hand", "of a simulated bench: wait for Enter at each placement as at a real one"),
     option("--resume RUN", "go on with a run, by the name that it ended with"),
     Group(

@@ -152,12 +152,12 @@ def camera_focus(args: argparse.Namespace) -> Answer:
     option("--seconds S", "how long it turns", default=30.0),
     option(
         "--amplitude RAD",
-        "how far pan goes to either side (default 0.07, or 0.15 of the narrowest view)",
+        "how far pan goes to a side (default 0.07, or 0.15 of a view)",
         type=positive_number,
     ),
     option(
         "--speed RAD_PER_S",
-        "of the fastest turns (default five amplitudes a second, or the limit)",
+        "of the fastest turns (default five amplitudes a second)",
         type=positive_number,
     ),
     help="measure how late the stamps are against the joints; turns the head to and fro",

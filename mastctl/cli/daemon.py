@@ -112,10 +112,7 @@ def followed(client: Client, operation_id: str, as_json: bool, timeout_s: float)
 
 @command(
     "stop",
-    option(
-        "--without-daemon",
-        "stop a head whose daemon is dead: opens the servo line of --config, stops there, and nothing else",
-    ),
+    option("--without-daemon", "of a head whose daemon is dead: stop on the servo line of --config"),
     *DAEMON,
 )
 def _stop(args: argparse.Namespace) -> Answer:

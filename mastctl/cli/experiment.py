@@ -99,10 +99,7 @@ def _pointing(args: argparse.Namespace) -> Answer:
     "demo",
     *TARGETS,
     option("--out DIR", "folder for the report", default=Path("mastctl_demo")),
-    option(
-        "--config FILE",
-        "a simulated rig of one's own, with its own seed; --seed then chooses views and pixels only",
-    ),
+    option("--config FILE", "a simulated rig of one's own, whose seed is its own"),
     option(f"--head {HEADS}", "simulated head (default ptu_d46_70, or that of --wire)"),
     WIRE,
     SPEED,

@@ -274,17 +274,9 @@ def _report_empty(path: Path, valid: np.ndarray, what: str) -> None:
 @command(
     "camera convert",
     option("IN", SOURCES, dest="source"),
-    option(
-        "OUT", "x.yaml (a camera file), x.cahvor, x.cameramodel, x.opencv.yaml, x.ros.yaml, x.kalibr.yaml"
-    ),
-    option(
-        "--camera NAME", "which camera, where IN has several; again for each of a Kalibr file", repeat=True
-    ),
-    option(
-        "--to mastctl|cahvor|opencv|ros|kalibr|mrcal",
-        "the format, where the name of OUT does not say it",
-        default="",
-    ),
+    option("OUT", "x.yaml (a camera file), x.cahvor, x.cameramodel, x.opencv.yaml, x.ros.yaml, ..."),
+    option("--camera NAME", "which camera, where IN has several; again for Kalibr", repeat=True),
+    option("--to mastctl|cahvor|opencv|ros|kalibr|mrcal", "where OUT does not say it", default=""),
     option(
         "--lens cahvor|radtan|plumb_bob|rational_polynomial|thin_prism|equidistant|tilted",
         "the lens of OUT (default: the plainest of its format that comes near enough)",
@@ -402,14 +394,8 @@ def camera_maps(args: argparse.Namespace) -> Answer:
     "camera mode",
     option("MAST.yaml", "the mast file as it was calibrated", dest="file"),
     option("--camera NAME", "which camera, where the file has several"),
-    option(
-        "--crop X Y WIDTH HEIGHT", "the part of the calibrated picture that is read, in its pixels", type=int
-    ),
-    option(
-        "--bin N...",
-        "so many pixels make one: one number, or one across and one down; after the crop",
-        default=[1],
-    ),
+    option("--crop X Y WIDTH HEIGHT", "the part of the calibrated picture that is read", type=int),
+    option("--bin N...", "pixels that make one, after the crop: one number, or across and down", default=[1]),
     option("--flip none|horizontal|vertical|both", "after crop and binning", default="none"),
     option("--out NEW.yaml", "the mast file to write", required=True),
     help="write a mast file for a crop, binning or flip of the calibrated pictures of a camera",

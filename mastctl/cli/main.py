@@ -36,7 +36,7 @@ OVERVIEW: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "track": ("steering requests", "follow a target while the rover moves"),
         "panorama": ("panorama requests", "take a panorama, any pixel of which points the mast"),
         "snapshot": ("service", "take a picture and write it to a file"),
-        "record": ("record requests", "begin and end a recording; list, inspect, repair and replay them"),
+        "record": ("service requests", "begin and end a recording; list, inspect, repair and replay them"),
         "stop": ("daemon", "stop the mast at once; --without-daemon if that is dead"),
         "estop": ("daemon", "stop the mast at once; nothing moves it until 'mastctl reset'"),
         "reset": ("daemon", "release an emergency stop; nothing moves by that"),

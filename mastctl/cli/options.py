@@ -76,9 +76,10 @@ def path(text: str) -> Path:
     return Path(text)
 
 
+ANY_NUMBER = ("RAD", "X", "Y", "Z", "U", "V", "NX", "NY", "NZ", "QW", "QX", "QY", "QZ", "LOW", "HIGH")
 READERS: Mapping[str, Callable[[str], Any]] = {
     **dict.fromkeys(("S", "M", "MM", "PX", "DEG", "HZ"), positive_number),
-    **dict.fromkeys(("RAD", "X", "Y", "Z", "U", "V", "LOW", "HIGH"), finite_number),
+    **dict.fromkeys((*ANY_NUMBER, "PAN", "TILT"), finite_number),
     **dict.fromkeys(("FILE", "DIR", "FOLDER", "IN", "OUT", "SURVEY"), path),
     "SEED": at_least(0),
     "N": at_least(1),
@@ -148,6 +149,8 @@ def option(usage: str, help: str, *, repeat: bool = False, **settings: Any) -> O
         found["nargs"], values = "+", [values[0].removesuffix("...")]
     if "|" in values[0]:
         found["choices"] = values[0].split("|")
+        if values[0].replace("|", "").isdigit():
+            found |= {"choices": [int(one) for one in found["choices"]], "type": int}
     else:
         found["metavar"] = tuple(values) if len(values) > 1 and "nargs" not in settings else " ".join(values)
         found["type"] = _reader(values)

@@ -1,4 +1,4 @@
-"""The daemon itself, what it knows and does, a picture of it, and its adapter to ROS 2."""
+"""The daemon itself, what it knows and does, its pictures and recordings, and its adapter to ROS 2."""
 
 from __future__ import annotations
 
@@ -7,17 +7,19 @@ import logging
 import os
 import re
 import signal
+import tempfile
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl import signals
 from mastctl.cli import output
 from mastctl.cli.daemon import CONFIG, DAEMON, URL, client_of, followed, queue_output
 from mastctl.cli.options import command, one_of, option
-from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, cell, chosen, tables_at
+from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, cell, chosen, tables_at, tables_of
 from mastctl.logs import QueuedHandler
 
 if TYPE_CHECKING:
@@ -103,9 +105,7 @@ def serve_config(config: Config, args: argparse.Namespace) -> None:
     one_of(
         option("--operations", "show the newest operations, newest first"),
         option("--operation ID", "show one operation with its steps and what it measured"),
-        option(
-            "--events TOPIC...", "show each change as it comes: of state, operation, ... or all", nargs="*"
-        ),
+        option("--events TOPIC...", "show each change as it comes, of all or some topics", nargs="*"),
     ),
     option("--key KEY", "with --events: of these keys only (a device, an id)", repeat=True),
     option("--count N", "with --events: end after so many (default: never)"),
@@ -246,7 +246,7 @@ def _ros2(args: argparse.Namespace) -> int:
         url = client.url
     client_name = f"ros2@{os.uname().nodename}:{os.getpid()}"
     queue_output()
-    with suppress(KeyboardInterrupt), signals.raised():
+    with suppress(KeyboardInterrupt):
         run(
             lambda: Client(url, timeout_s=10.0, name=client_name),
             RosNames(args.prefix, args.base),
@@ -254,3 +254,88 @@ def _ros2(args: argparse.Namespace) -> int:
             lambda node: output.show(args, Answer({"node": node, "url": url}, f"{node} is a node of {url}")),
         )
     return 0
+
+
+RECORDING = option("FILE", "an MCAP file, or a folder of segments")
+
+
+@command("record show", RECORDING, help="say what a recording holds, whole or not", example="afternoon.mcap")
+def _show_recording(args: argparse.Namespace) -> Answer:
+    from mastctl.recorder.recorded import read_whole
+
+    found = read_whole(args.file).summary()
+    whole = found["complete"] and not found["damaged"]
+    state = "whole" if whole else f"'mastctl record repair {args.file}' writes what is whole anew"
+    return Answer(found, [*tables_of(found, str(args.file)), state])
+
+
+@command(
+    "record repair",
+    RECORDING,
+    option("--out FILE", "where to (default: FILE.repaired.mcap)"),
+    help="write what is whole in a recording into a file with an index",
+    example="broken.mcap --out whole.mcap",
+)
+def _repair(args: argparse.Namespace) -> Answer:
+    from drivers.recordings.frames import recording_files
+    from mastctl.recorder.recorded import repair
+
+    out = args.out or args.file.with_name(f"{args.file.stem}.repaired.mcap")
+    found = dict(repair(recording_files(args.file), out))
+    return Answer({"file": str(out), "was_complete": found.pop("complete"), **found})
+
+
+@command(
+    "record replay",
+    RECORDING,
+    option("--mast OTHER.yaml", "evaluate as if this mast file had been used"),
+    LISTEN,
+    help="serve a recording, or evaluate its pointings again with another mast file",
+    example="afternoon.mcap --mast other.yaml",
+)
+def _replay(args: argparse.Namespace) -> Answer | int:
+    from calib.files.mast_file import load_rig
+    from mastctl.recorder.recorded import read_whole
+    from mastctl.recorder.what_if import what_if
+
+    if args.mast is None:
+        return _served(args)
+    if args.listen is not None:
+        raise WrongUse("--listen goes without --mast: a what-if is evaluated, not served")
+    document = what_if(read_whole(args.file), load_rig(args.mast))
+    return Answer(document, _shown(document, args.mast.name))
+
+
+def _served(args: argparse.Namespace) -> int:
+    """Serve a recording until it is ended."""
+    from mastctl.config import load_config
+    from mastctl.recorder.recorded import read_whole, replay_files
+
+    queue_output()
+    with tempfile.TemporaryDirectory(prefix="mastctl-replay-") as folder, suppress(KeyboardInterrupt):
+        path = replay_files(read_whole(args.file), Path(folder), {})
+        serve_config(load_config(path), args)
+    return 0
+
+
+def _shown(document: Mapping[str, Any], name: str) -> Iterator[Shown]:
+    """The pointings and hand-offs, and what they are together, with a mast file of this name."""
+    from mastctl.report.pages import x_y
+
+    for title, keys in (("pointings", ("operation", "pointing")), ("handoffs", ("time", "camera"))):
+        rows = [
+            [*(str(one[key]) for key in keys), x_y(one["recorded_px"], 3),
+             one["error"] or x_y(one["would_be_px"], 3), x_y(one["sigma_px"], 3)]
+            for one in document[title]
+        ]  # fmt: skip
+        if rows:
+            yield Shown(title, (*keys, "recorded (px)", "would be (px)", "sigma (px)"), rows)
+    rows = [
+        [kind, str(one["number"]), x_y(one["recorded"], 3), x_y(one["would_be"], 3)]
+        for kind, one in document["rms_px"].items()
+    ]
+    headings = ("what", "number", "recorded rms x, y (px)", "would be rms x, y (px)")
+    others = document["not_worked_out"].items()
+    yield Shown(
+        f"with {name}", headings, rows, [f"operation {one} is not worked out: {why}" for one, why in others]
+    )

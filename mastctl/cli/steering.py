@@ -33,11 +33,7 @@ FRAME = option("--frame rover|site", "frame of --position (default rover)")
         CAMERA,
         POSITION,
         option("--angles PAN TILT", "joint angles, radians", type=angle_rad),
-        option(
-            "--rates PAN TILT",
-            "jog: turn at these rates, rad/s, until Ctrl-C or --seconds",
-            type=finite_number,
-        ),
+        option("--rates PAN TILT", "jog: turn at these, rad/s, until Ctrl-C or --seconds"),
         required=True,
     ),
     AT,
@@ -49,13 +45,9 @@ FRAME = option("--frame rover|site", "frame of --position (default rover)")
     one_of(
         option("--range M", "the distance of what the pixel shows"),
         option("--ground Z", "it lies level at this z, rover frame"),
-        option(
-            "--plane X Y Z NX NY NZ",
-            "or in the plane through a point at right angles to a direction, rover frame",
-            type=finite_number,
-        ),
+        option("--plane X Y Z NX NY NZ", "or in the plane through a point at right angles to a direction"),
     ),
-    option("--pointings 1|2", "how often to point (default 1)", type=int, choices=(1, 2)),
+    option("--pointings 1|2", "how often to point (default 1)"),
     option("--no-wait", "print the operation's id and do not wait"),
     option("--seconds S", "with --rates: for how long"),
     TIMEOUT,
@@ -180,17 +172,8 @@ def _start(args: argparse.Namespace) -> Answer:
 @command(
     "track pose",
     option("--position X Y Z", "of the rover in the site frame, metres", required=True),
-    option(
-        "--quaternion QW QX QY QZ",
-        "site from rover (default: not turned)",
-        type=finite_number,
-        default=[1.0, 0.0, 0.0, 0.0],
-    ),
-    option(
-        "--sigma M RAD",
-        "of the motion since the pose before, each axis; needed while a track runs",
-        type=finite_number,
-    ),
+    option("--quaternion QW QX QY QZ", "site from rover (default: not turned)", default=[1.0, 0.0, 0.0, 0.0]),
+    option("--sigma M RAD", "of the motion since the pose before; for a track", type=finite_number),
     option("--time S", "by your clock, seconds", type=finite_number),
     option("--no-look", "carry the track over, without a new measurement"),
     TIMEOUT,

@@ -1,17 +1,24 @@
-"""Requests of a client that neither point nor track: what a daemon keeps, panoramas, a simulated rover."""
+"""Requests that neither point nor track: what a daemon keeps, panoramas, a simulated rover, live pictures."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+from urllib.parse import urlencode
 
 from mastctl import answers
-from mastctl.client.connection import DaemonHttp, escaped, given
+from mastctl.client.connection import PREFIX, Broken, ClientError, DaemonHttp, escaped, given, trusted
+
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
 
 
 class Calls:
-    """Configuration, mast files, recordings, benches, panoramas, targets; of a simulated rover its true pose,
-    boards, time and faults.
+    """Configuration, mast files, recordings, benches, panoramas, targets, live pictures; of a simulated rover
+    its true pose, boards, time and faults.
     """
 
     daemon: DaemonHttp
@@ -189,3 +196,95 @@ class Calls:
     def clear_faults(self, device: str | None = None) -> None:
         """Switch the faults of one simulated device off, or all."""
         self.daemon.command(answers.FaultsSet, "DELETE", "/simulation/faults", params=given(device=device))
+
+    @contextmanager
+    def live_pictures(self, *cameras: str) -> Iterator[LivePictures]:
+        """Open a line on which pictures of some cameras come, as JPEG at the cameras' own rate.
+
+        Raises ClientError ``no_daemon``; ``refused`` if the daemon does not send them, with its reason;
+        ``no_websockets`` where that package is missing.
+        """
+        try:
+            from websockets.exceptions import InvalidHandshake, InvalidURI
+            from websockets.sync.client import connect, unix_connect
+        except ImportError:
+            reason = "live pictures need the package websockets; 'pip install websockets' brings it"
+            raise ClientError("no_websockets", reason) from None
+        daemon, path = self.daemon, self.daemon.socket_path
+        base = "http://localhost" if path is not None else daemon.url.rstrip("/")
+        query = urlencode([("camera", one) for one in cameras] + [("on_request", "true"), ("every", "true")])
+        address = f"ws{base.removeprefix('http')}{PREFIX}/images?{query}"
+        options: dict[str, Any] = {"additional_headers": daemon.shown, "compression": None, "max_size": None}
+        try:
+            if path is not None:
+                line = unix_connect(path, address, **options)
+            else:
+                secure = trusted() if address.startswith("wss") else None
+                line = connect(address, proxy=None, ssl=secure, **options)
+        except (InvalidHandshake, InvalidURI) as error:
+            raise ClientError(
+                "refused", f"the daemon at {daemon.url} sends no pictures: {_why(error)}"
+            ) from None
+        except (OSError, TimeoutError):
+            raise daemon.no_daemon() from None
+        with line:
+            yield LivePictures(line, daemon.url)
+
+
+@dataclass(frozen=True, eq=False)
+class LivePicture:
+    """A camera's JPEG as it came, and its ``facts``: ``camera``, ``frame_id``, ``mid_exposure_s``, ..."""
+
+    facts: dict[str, Any]
+    jpeg: bytes
+
+
+class LivePictures:
+    """An open line of live pictures, for one thread. A camera sends its next picture after `wanted`: the
+    first one too.
+    """
+
+    def __init__(self, line: ClientConnection, url: str) -> None:
+        self._line = line
+        self._url = url
+
+    def wanted(self, camera: str) -> None:
+        """Request a camera's next picture. Raises ClientError as `next`."""
+        with self._breaks():
+            self._line.send(camera)
+
+    def next(self, timeout_s: float) -> LivePicture | None:
+        """Return the next picture, None if there was none for so many seconds.
+
+        Raises ClientError ``no_daemon`` if the line broke or the daemon has ended, ``bad_answer``.
+        """
+        try:
+            with self._breaks():
+                message = self._line.recv(timeout=timeout_s)
+            if isinstance(message, str):
+                raise ValueError
+            length = 4 + int.from_bytes(message[:4], "little")
+            return LivePicture(dict(json.loads(message[4:length])), message[length:])
+        except TimeoutError:
+            return None
+        except ValueError:
+            raise ClientError("bad_answer", f"the program at {self._url} sends no pictures") from None
+
+    @contextmanager
+    def _breaks(self) -> Iterator[None]:
+        from websockets.exceptions import ConnectionClosed
+
+        try:
+            yield
+        except TimeoutError:
+            raise
+        except (ConnectionClosed, OSError) as error:
+            raise Broken("no_daemon", f"the line of pictures of {self._url} broke: {error}") from None
+
+
+def _why(error: Exception) -> str:
+    """The sentence of a refusal."""
+    try:
+        return str(json.loads(error.response.body)["error"]["message"])  # type: ignore[attr-defined]
+    except (AttributeError, ValueError, LookupError, TypeError):
+        return str(error)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, cast
@@ -18,8 +17,6 @@ from mastctl.frame_facts import FrameFacts, facts_in
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-
-    from mastctl.client.pictures import LivePictures
 
 ENDED = ("done", "failed", "stopped")
 STOP_ANSWER_S = 5.0  # the daemon answers a stop within 3 s
@@ -295,15 +292,6 @@ class Client(LeaseCalls, Calls):
     def jog(self) -> Jog:
         """Return a context in which the head turns at the `Jog.rates` set; it sends the heartbeats itself."""
         return Jog(lambda: self.daemon.beside(ANSWER_S))
-
-    def live_pictures(self, *cameras: str) -> AbstractContextManager[LivePictures]:
-        """Return a context in which pictures of some cameras come, as JPEG at the cameras' own rate."""
-        try:
-            from mastctl.client.pictures import live_pictures  # WebSockets, only where pictures are watched
-        except ImportError:
-            reason = "live pictures need the package websockets; 'pip install websockets' brings it"
-            raise ClientError("no_websockets", reason) from None
-        return live_pictures(self.daemon, cameras)
 
     def snapshot(
         self,

@@ -28,7 +28,7 @@ from calib.errors import BadFile
 from calib.files import digest_of
 from calib.files.mast_file import parse_rig
 from mastctl.client import Client, ClientError
-from mastctl.client.pictures import LivePicture
+from mastctl.client.calls import LivePicture
 from mastctl.ros2 import NoRos, messages
 from mastctl.ros2.goals import ENDED, Actions, Goal, GoalOutcome, RosSteering
 from mastctl.ros2.state import NS, ClockExchange, DaemonState, RosNames, real_from_monotonic_ns
