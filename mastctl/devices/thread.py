@@ -6,8 +6,8 @@ thread that hangs inside a driver cannot be ended from outside: it is left alone
 thread), calls to it fail at once, and it serves again when the driver returns.
 
 The stops of a head go out whatever hangs, and no move goes out before all of them are back: a driver that
-hangs may carry out an old stop much later. A move that was sent meanwhile would end half-way without a
-reason; a stop that comes back late is a fault.
+hangs may carry out an old stop much later, and a move that was sent meanwhile would end half-way without a
+reason.
 
 Deadlines and pacing run on a clock that goes on while a thread waits, whatever clock stamps the data.
 """
@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 T = TypeVar("T")
 Check = Callable[[], None]
 
-LONGEST_MESSAGE, LONGEST_CODE = 400, 60  # of what a driver says went wrong
+LONGEST_MESSAGE = 400  # of what a driver says went wrong
 CHECKED_S = 0.02  # how late a stop is noticed by a caller that waits
 AFTER_ERROR_S = 0.2  # before the device is tried again between calls
 
@@ -205,8 +205,10 @@ class DeviceThread:
             return error
         message = one_line(error, LONGEST_MESSAGE)
         if isinstance(error, DriverError) and message:
-            as_ours = getattr(error, "device", None) == self._device and message == str(error)
-            return error if as_ours else _named(error, message, self._device)
+            named = f"{self._device}: {message.removeprefix(f'{self._device}: ')}"
+            error.args, error.device = (named,), self._device
+            if str(error) == named:
+                return error
         log.debug("%s: %s raised", self._device, name, exc_info=error)
         return DriverError(
             f"the driver failed in {name}: {type(error).__name__}{': ' + message if message else ''}",
@@ -305,17 +307,6 @@ class DeviceThread:
             log.info("%s: %s works again", self._device, name)
         elif error is not None and not known and late_s is None:
             log.warning("%s", error)
-
-
-def _named(fault: DriverError, message: str, device: str) -> DriverError:
-    """Return the same error with this message after the device's name, if its class can be made so."""
-    message = message.removeprefix(f"{device}: ")
-    try:
-        return type(fault)(message, device=device, detail=fault.detail)
-    except Exception:  # a class from outside may want other parameters
-        named = DriverError(message, device=device)
-        named.code = one_line(fault.code, LONGEST_CODE) or DriverError.code
-        return named
 
 
 @dataclass(frozen=True)
@@ -510,14 +501,8 @@ class HeadThread(DeviceThread):
                 self._good_s = ended_s
             else:
                 self._failed = inside, error
-            given_up = self._stop_fault is not None and ended_s > inside.requested_s + timeout_s
-            late = given_up or ended_s > inside.began_s + timeout_s
-            if late:
-                self._stop_fault = StandingFault(
-                    self._device, NoReply.code, message, inside.requested_s, UNTIL
-                )
             self._stops_changed.notify_all()
-        if late:
+        if ended_s > inside.requested_s + timeout_s:
             log.warning("%s", message)
         if error is not None:
             raise error
