@@ -51,7 +51,7 @@ def test_the_pointing_loop_runs_on_it(hardware: Hardware, mast_file: Path) -> No
     stored = load_rig(mast_file)
     limits = Limits((-2.0, 2.0), (-1.2, 0.5), 1.5)
     clock = SystemClock()
-    devices = Devices(hardware, limits, stored.digest, clock, stored.rig)
+    devices = Devices(hardware.pan_tilt, hardware.cameras, limits, stored.digest, clock, stored.rig)
     steps: list[Step] = []
 
     def point(**target: Any) -> PointingResult:

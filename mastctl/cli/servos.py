@@ -132,10 +132,10 @@ def _info(args: argparse.Namespace) -> Answer:
     example="/dev/ttyUSB0 1 2",
 )
 def _set_id(args: argparse.Namespace) -> Answer:
-    from mastctl.devices.opening import line_held
+    from mastctl.devices.opening import line_locked
 
     bench = _bench(args)
-    with line_held(args.port), _link(args, bench) as link:
+    with line_locked(args.port), _link(args, bench) as link:
         bench.set_id(link, args.id, args.new_id, args.new_baud, torque_off=args.torque_off)
         return Answer({"id": args.new_id, "old_id": args.id, "baud": link.baud})
 
@@ -160,7 +160,7 @@ def _unit_info(args: argparse.Namespace) -> Answer:
     example="/dev/ttyUSB0",
 )
 def _home(args: argparse.Namespace) -> Answer:
-    from mastctl.devices.opening import line_held
+    from mastctl.devices.opening import line_locked
 
     if not args.sweep_full_range:
         raise WrongUse(
@@ -169,7 +169,7 @@ def _home(args: argparse.Namespace) -> Answer:
         )
     bench = _unit_bench()
     output.tell("homing: both axes sweep their full range, up to half a minute")
-    with line_held(args.port):
+    with line_locked(args.port):
         return _unit(bench.home(args.port, args.baud or bench.bauds[0]))
 
 

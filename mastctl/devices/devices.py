@@ -12,7 +12,6 @@ import logging
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from typing import Protocol
 
 from calib.geometry.rig import Rig
 from drivers.clock import Clock
@@ -44,51 +43,25 @@ FAULTS = {
 }
 
 
-class HardwareLike(Protocol):
-    """What `drivers.open_hardware` returns, as far as it is used here."""
-
-    @property
-    def pan_tilt(self) -> PanTilt: ...
-    @property
-    def cameras(self) -> Mapping[str, Camera]: ...
-
-
 class Devices(Cameras):
-    """The head and the cameras behind their threads.
+    """The head and the cameras behind their threads; closing the drivers is left to their opener.
 
-    Parameters
-    ----------
-    hardware
-        The opened drivers; closing them is left to their opener, after `close`.
-    limits
-        Limits and keep-outs, checked in `move` as the last thing before the driver is called.
-    mast_digest
-        SHA-256 (hex) of the mast file in use, part of every frame's facts.
-    clock
-        Stamps are judged against it; deadlines run on it too, or in real time if it is turned by hand.
-    rig
-        The mast file's content; without it image sizes are not checked and no camera is declared frozen.
-    camera_grace_s
-        How long past its time a camera may take before it hangs, seconds.
-    machine
-        Gets whether the head moves and what is wrong with it; its publisher each reading, each frame's facts
-        and each device's faults. One of its own by default.
+    Stamps are judged against the ``clock``; deadlines run on it too, or in real time if it is turned by hand.
+    ``mast_digest`` is the SHA-256 (hex) of the mast file whose content is ``rig``; without that, image sizes
+    are not checked and no camera is declared frozen. ``machine`` gets whether the head moves and what is
+    wrong with it; its publisher each reading, each frame's facts and each device's faults.
 
-    Attributes
-    ----------
-    on_turn
-        Called in the head's own thread each time it is about to read, whatever comes of that; must not wait.
-    latched
-        Returns what refuses every move while an emergency stop is latched; must not wait.
-    reports
-        Where each axis was sent and is in counts; empty for a head that does not know. Never edited.
+    ``on_turn`` is called in the head's own thread each time it is about to read, whatever comes of that;
+    ``latched`` returns what refuses every move while an emergency stop is latched. Neither may wait.
+    ``reports`` says where each axis was sent and is in counts; empty for a head that does not know.
 
     Raises BadOptions if the head says that it speeds up faster than the limits allow.
     """
 
     def __init__(
         self,
-        hardware: HardwareLike,
+        pan_tilt: PanTilt,
+        cameras: Mapping[str, Camera],
         limits: Limits,
         mast_digest: str,
         clock: Clock,
@@ -102,14 +75,14 @@ class Devices(Cameras):
         self._publisher = self._machine.publisher
         self.on_turn: Callable[[], None] = lambda: None
         self.latched: Callable[[], Stopped | None] = lambda: None
-        self._pan_tilt = hardware.pan_tilt
-        self.judge = KeepOutJudge(limits, hardware.pan_tilt, clock, HEAD, rig, sun)
+        self._pan_tilt = pan_tilt
+        self.judge = KeepOutJudge(limits, pan_tilt, clock, HEAD, rig, sun)
         self._blocks: dict[object, str] = {}  # why no move is let out, by who blocks it
         self._closed = False
         self.reports: Mapping[str, AxisReport] = {}
         self._reported_s: Mapping[str, float] = {}  # what the head reports about itself, and since when
         store = FrameStore(mast_digest, new_run, self._new_frame)
-        super().__init__(hardware.cameras, store, clock, rig, camera_grace_s)
+        super().__init__(cameras, store, clock, rig, camera_grace_s)
         self._head = HeadThread(
             HEAD,
             lambda: self._pan_tilt.stop(),

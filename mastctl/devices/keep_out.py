@@ -160,15 +160,15 @@ class KeepOuts:
 
     def free_span(self, place: Pair, most: Span) -> Span | None:
         """Return ``most``, shrunk evenly towards a place in it until no keep-out reaches into it, or None."""
-        span, (pan, tilt) = most, place
-        for part in range(SPAN_PARTS - 1, -2, -1):
+        for part in range(SPAN_PARTS, -1, -1):
+            share = part / SPAN_PARTS
+            low, high = (
+                (place[0] + share * (pan - place[0]), place[1] + share * (tilt - place[1]))
+                for pan, tilt in most.corners
+            )
+            span = Span.around(low, high)
             if not any(span.enters(full) for full in self.full):
                 return span
-            (left, low), (right, high) = (
-                (pan + part / SPAN_PARTS * (to_pan - pan), tilt + part / SPAN_PARTS * (to_tilt - tilt))
-                for to_pan, to_tilt in most.corners
-            )
-            span = Span((left, right), (low, high))
         return None
 
     def nearest_free(self, start: Span, goal: Pair, rests: bool) -> Pair | None:

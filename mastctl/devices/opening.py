@@ -6,14 +6,12 @@ it; knows its latch; and moves it within limits, around keep-outs and off the su
 
 from __future__ import annotations
 
-import contextlib
 import math
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import SimpleNamespace
 
 from calib.files.mast_file import StoredRig
 from drivers.clock import Clock
@@ -79,9 +77,10 @@ def devices_beside(
     """
     stored = bounds.stored
     assert stored is not None
-    with _alone(settings, moves, bounds.state), open_hardware(settings, clock) as hardware:
-        mine = SimpleNamespace(pan_tilt=hardware.pan_tilt, cameras={}) if own_cameras else hardware
-        devices = Devices(mine, bounds.limits, stored.digest, clock, stored.rig, sun=bounds.sun)
+    place = _locked(head_name(settings), moves, bounds.state)
+    with place, open_hardware(settings, clock) as hardware:
+        head, cameras = hardware.pan_tilt, {} if own_cameras else hardware.cameras
+        devices = Devices(head, cameras, bounds.limits, stored.digest, clock, stored.rig, sun=bounds.sun)
         if not moves:
             devices.block_moves(STILL, STILL)
         try:
@@ -98,7 +97,7 @@ def head_beside(
 
     Parameters and errors are those of `devices_beside`; no camera is opened. Leaving closes what was opened.
     """
-    with _alone(settings, moves, bounds.state), ExitStack() as stack:
+    with _locked(head_name(settings), moves, bounds.state), ExitStack() as stack:
 
         def opened() -> GuardedHead:
             head = stack.enter_context(open_hardware(replace(settings, cameras={}), clock)).pan_tilt
@@ -109,12 +108,12 @@ def head_beside(
 
 
 @contextmanager
-def line_held(port: str) -> Iterator[None]:
+def line_locked(port: str) -> Iterator[None]:
     """Lock the place of the head at a line, for a program that moves what is on it without a configuration.
 
     Limits and keep-outs are not known then. Raises Estopped, StateInUse.
     """
-    with _locked(stable_name(port), moves=True):
+    with _locked(stable_name(port), True):
         yield
 
 
@@ -176,27 +175,16 @@ class GuardedHead(PanTilt):
 
 
 @contextmanager
-def _alone(settings: HardwareSettings, moves: bool, state: Path | None) -> Iterator[None]:
-    """Lock the head's place; one that is to be moved has no stop latched."""
-    name = head_name(settings)  # in memory it is no other program's
-    with contextlib.nullcontext() if name is None else _locked(name, moves=moves, state=state):
-        yield
-
-
-@contextmanager
-def _locked(name: str, *, moves: bool, state: Path | None = None) -> Iterator[None]:
-    place = take_head(name)
+def _locked(name: str | None, moves: bool, state: Path | None = None) -> Iterator[None]:
+    """Lock a head's place, which one in memory has not; one that is to be moved has no stop latched."""
+    place = None if name is None else take_head(name)
     try:
-        if moves:
-            _check_latch(name, state)
+        if name is not None and moves:
+            causes = latched_at([*head_folders(name), *([] if state is None else [state])])
+            if causes:
+                until = "at the head's daemon; until then nothing moves the head"
+                raise Estopped(f"{latched_sentence(causes)} {until}")
         yield
     finally:
         if place is not None:
             place.close()
-
-
-def _check_latch(name: str, state: Path | None) -> None:
-    """Pass a head whose emergency stop is not latched. Raises Estopped."""
-    entries = latched_at([*head_folders(name), *([] if state is None else [state])])
-    if entries:
-        raise Estopped(f"{latched_sentence(entries)} at the head's daemon; until then nothing moves the head")

@@ -453,18 +453,18 @@ class HeadThread(DeviceThread):
                     at_s = max(requested_s + self._patience_s, next_try_s(began_s, timeout_s))
                     beside = now_s >= at_s
                     if beside:
-                        alone = self._go_beside(requested_s, timeout_s)
+                        alone = self._go_beside(requested_s)
                         continue
                     again_s = min(deadline_s, at_s)
                 self._stops_changed.wait(again_s - now_s)
 
-    def _go_beside(self, requested_s: float, timeout_s: float) -> str:
+    def _go_beside(self, requested_s: float) -> str:
         """Send a stop from a thread of its own; return why that cannot be done. The lock is kept."""
         inside = _Inside(requested_s, self._clock.now_s())
 
         def go() -> None:
             try:
-                self._into_driver(inside, timeout_s)
+                self._into_driver(inside)
             except (DriverError, MastctlError) as error:
                 log.warning("a stop beside a hanging call failed: %s", error)
 
@@ -483,9 +483,9 @@ class HeadThread(DeviceThread):
             inside = _Inside(now_s if self._queued_s is None else self._queued_s, now_s)
             self._queued_s = None
             self._inside.append(inside)
-        self._into_driver(inside, self._overdue_s)
+        self._into_driver(inside)
 
-    def _into_driver(self, inside: _Inside, timeout_s: float) -> None:
+    def _into_driver(self, inside: _Inside) -> None:
         """Make one stop, and wake those that wait for one."""
         error: Exception | None = None
         try:
@@ -502,7 +502,7 @@ class HeadThread(DeviceThread):
             else:
                 self._failed = inside, error
             self._stops_changed.notify_all()
-        if ended_s > inside.requested_s + timeout_s:
+        if ended_s > inside.requested_s + self._overdue_s:
             log.warning("%s", message)
         if error is not None:
             raise error

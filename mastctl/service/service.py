@@ -165,7 +165,8 @@ class Service:
         config, clock, machine = self.config, self.clock, self.machine
         new_run = _run_names(self.hardware, clock)
         self.devices = Devices(
-            self.hardware,
+            self.hardware.pan_tilt,
+            self.hardware.cameras,
             config.limits,
             mast.stored.digest,
             clock,

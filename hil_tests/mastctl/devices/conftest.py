@@ -23,7 +23,7 @@ def hardware(clock: Turned) -> FakeHardware:
 
 @pytest.fixture
 def devices(hardware: FakeHardware, clock: Turned) -> Iterator[Devices]:
-    made = Devices(hardware, LIMITS, DIGEST, clock, rig())
+    made = Devices(hardware.pan_tilt, hardware.cameras, LIMITS, DIGEST, clock, rig())
     with clock.at_work():
         made.read()
         yield made

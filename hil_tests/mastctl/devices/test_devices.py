@@ -628,7 +628,7 @@ def test_a_camera_of_another_size_is_refused_at_the_start() -> None:
     with pytest.raises(
         BadFrame, match=r"navcam_left: the image is 64x47 px where the mast file has 64x48 px"
     ):
-        Devices(hardware, LIMITS, DIGEST, SystemClock(), rig())
+        Devices(hardware.pan_tilt, hardware.cameras, LIMITS, DIGEST, SystemClock(), rig())
     until(lambda: set(threading.enumerate()) <= before, "no thread is left")
 
 
@@ -667,10 +667,10 @@ def test_a_camera_in_another_sensor_mode_is_refused_with_the_remedy(
     modal = replace(little, cameras={**little.cameras, "navcam_left": held})
     if words:
         with pytest.raises(BadFrame) as refused:
-            Devices(hardware, LIMITS, DIGEST, SystemClock(), modal)
+            Devices(hardware.pan_tilt, hardware.cameras, LIMITS, DIGEST, SystemClock(), modal)
         assert words in str(refused.value)
         return
-    devices = Devices(hardware, LIMITS, DIGEST, SystemClock(), modal)
+    devices = Devices(hardware.pan_tilt, hardware.cameras, LIMITS, DIGEST, SystemClock(), modal)
     assert devices.sensor_modes == {"navcam_left": ModalCamera.MODE}
     devices.close()
 
@@ -679,7 +679,7 @@ def test_a_picture_right_after_the_start_is_one_whose_angles_are_known(
     hardware: FakeHardware, clock: Turned
 ) -> None:
     hardware.fake_cameras["navcam_left"] = Ticking("navcam_left", 1, clock)  # has taken pictures for long
-    devices = Devices(hardware, LIMITS, DIGEST, clock, rig())
+    devices = Devices(hardware.pan_tilt, hardware.cameras, LIMITS, DIGEST, clock, rig())
     try:
         begun_s = clock.now_s()
         may_be_old_s = begun_s - 1.0
@@ -694,7 +694,7 @@ def test_a_picture_right_after_the_start_is_one_whose_angles_are_known(
 
 def test_close_stops_the_head_and_leaves_no_thread(hardware: FakeHardware, clock: Turned) -> None:
     before = set(threading.enumerate())
-    devices = Devices(hardware, LIMITS, DIGEST, clock, rig())
+    devices = Devices(hardware.pan_tilt, hardware.cameras, LIMITS, DIGEST, clock, rig())
     devices.frames(list(hardware.cameras), clock.now_s(), 1.0)
     devices.move(0.1, 0.1)
     devices.close()

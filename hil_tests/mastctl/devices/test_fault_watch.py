@@ -23,7 +23,7 @@ def machine(clock: Turned) -> StateMachine:
 @pytest.fixture
 def devices(hardware: FakeHardware, machine: StateMachine, clock: Turned) -> Iterator[Devices]:
     limits = Limits((-2.0, 2.0), (-1.0, 1.0), 0.5)
-    made = Devices(hardware, limits, "0" * 64, clock, rig(), machine=machine)
+    made = Devices(hardware.pan_tilt, hardware.cameras, limits, "0" * 64, clock, rig(), machine=machine)
     with clock.at_work():
         clock.until(lambda: machine.standing.state == "ready", "a first reading")
         yield made

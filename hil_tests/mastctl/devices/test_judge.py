@@ -65,7 +65,7 @@ def hardware() -> FakeHardware:
 
 @pytest.fixture
 def devices(hardware: FakeHardware) -> Iterator[Devices]:
-    made = Devices(hardware, LIMITS, "0" * 64, SystemClock(), rig())
+    made = Devices(hardware.pan_tilt, hardware.cameras, LIMITS, "0" * 64, SystemClock(), rig())
     yield made
     made.close()
 

@@ -173,7 +173,9 @@ def test_the_service_takes_a_head_that_dithers_for_one_at_rest(clock: Turned) ->
         return Reading(shaking(count[0]), 0.0, count[0] % 2 == 0, clock.now_s())
 
     hardware.head.answer = answer
-    shaken = Devices(hardware, Limits((-2.0, 2.0), (-1.0, 1.0), 0.5), "0" * 64, clock, rig())
+    shaken = Devices(
+        hardware.pan_tilt, hardware.cameras, Limits((-2.0, 2.0), (-1.0, 1.0), 0.5), "0" * 64, clock, rig()
+    )
     with clock.at_work():
         clock.sleep(1.5)
         assert not any(shaken.read().moving for _ in range(20))

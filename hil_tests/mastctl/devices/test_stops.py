@@ -200,7 +200,7 @@ def test_closing_ends_whatever_hangs_and_stops_a_late_move(
     for name in ("READ_TIMEOUT_S", "MOVE_TIMEOUT_S", "STOP_TIMEOUT_S"):
         monkeypatch.setattr(devices_module, name, 0.3)
     hardware = FakeHardware()  # closing waits for threads in real time
-    devices = Devices(hardware, LIMITS, "0" * 64, SystemClock(), rig())
+    devices = Devices(hardware.pan_tilt, hardware.cameras, LIMITS, "0" * 64, SystemClock(), rig())
     hangs = Hangs(hardware, *hanging)
     for call in (CALLS["move"], CALLS["read"]):
         try:

@@ -150,7 +150,9 @@ def test_the_sun_is_kept_out_where_the_head_reads_it() -> None:
 def test_what_the_devices_read_is_true_by_their_rigs_joints() -> None:
     hardware = FakeHardware()
     hardware.head.pan_rad = 0.7
-    devices = Devices(hardware, LIMITS, "0" * 64, SystemClock(), replace(rig(), joints=TOLD))
+    devices = Devices(
+        hardware.pan_tilt, hardware.cameras, LIMITS, "0" * 64, SystemClock(), replace(rig(), joints=TOLD)
+    )
     try:
         reading = devices.read()
         assert reading.true_rad == pytest.approx(TOLD.true_rad((0.7, 0.0), reading.approach))

@@ -6,7 +6,6 @@ import math
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -119,7 +118,7 @@ def rig() -> Iterator[Rig]:
     panel = FaultPanel(clock.now_s, ())
     with clock.at_work():
         head = Watched(SimulatedPanTilt(HEAD, clock, panel))
-        devices = Devices(SimpleNamespace(pan_tilt=head, cameras={}), LIMITS, "0" * 64, clock)
+        devices = Devices(head, {}, LIMITS, "0" * 64, clock)  # type: ignore[arg-type]
         operations = OperationRunner(devices, clock)
     made = Rig(clock, panel, head, devices, operations, Jogs(operations, devices, clock))
     made.pass_by(0.1)

@@ -129,7 +129,9 @@ class Rover:
             self.clock,
         )
         limits = Limits((-2.6, 2.6), (-1.2, 0.5), 1.0)
-        self.devices = Devices(self.hardware, limits, "0" * 64, self.clock, self.rig)
+        self.devices = Devices(
+            self.hardware.pan_tilt, self.hardware.cameras, limits, "0" * 64, self.clock, self.rig
+        )
         self.limits = limits
         assert self.hardware.simulation is not None
         self.truth = self.hardware.simulation
