@@ -1,15 +1,26 @@
-"""One daemon after the other in this process, and the requests of a test to its rover.
+"""The process that a worker's daemons live in: ``python -m mastctl.testing.daemons PARENT``.
 
-A test gets a daemon of its own. Nothing of the test before is left: no faults, track, stop, mast file in use,
-place of head and rover, or time of the clock.
+It takes one JSON order a line on stdin and answers each with one on stdout. A test gets a daemon of its own;
+nothing of the test before is left: no faults, track, stop, mast file in use, place of head and rover, or time
+of the clock.
+
+The process ends when stdin does, and when the process PARENT is gone: a copy of that process, forked by a
+test, may hold stdin open. A worker of pytest-xdist outlives the pytest that made it by many seconds: that
+pytest is watched too.
 """
 
 from __future__ import annotations
 
+import json
+import logging
 import math
+import os
+import sys
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from calib.errors import BadFile
 from calib.files.mast_file import load_rig, save_rig
@@ -20,7 +31,8 @@ from drivers.sim.rover import RoverModel
 from mastctl.config import Config, Listen, load_config, not_simulated
 from mastctl.daemon import RunningDaemon
 from mastctl.devices.frames import camera_and_sequence
-from mastctl.errors import NotKnown, NotNow
+from mastctl.errors import NotKnown, NotNow, error_body
+from mastctl.logs import QueuedHandler, queued
 from mastctl.motion.track import RoverPose
 
 USUAL = {"samples": 1, "speed": "max"}
@@ -33,10 +45,10 @@ class Daemons:
         self._daemon: RunningDaemon | None = None
         self._config: Config | None = None  # of the one that runs, or ran last
 
-    def do(self, word: str, order: dict[str, Any]) -> Any:
+    def do(self, name: str, order: dict[str, Any]) -> Any:
         """Carry out an order and return its answer, fit for JSON."""
-        action = getattr(self, f"_do_{word}")
-        if word in ("open", "close", "start") or self._daemon is None:
+        action = getattr(self, f"_do_{name}")
+        if name in ("open", "close", "start") or self._daemon is None:
             return action(**order)
         with self._daemon.service.clock.at_work():
             return action(**order)
@@ -49,13 +61,13 @@ class Daemons:
 
     def _do_open(
         self, config: str | None, picture_width_px: int | None, simulation: dict[str, Any], folder: str
-    ) -> dict[str, Any]:
+    ) -> str:
         self._do_close()
         wanted = config_for_a_test(config, picture_width_px, simulation, Path(folder))
         self._daemon = RunningDaemon(wanted)
         port = int(self._daemon.url.rpartition(":")[2])
         self._config = replace(wanted, listen=Listen(port=port))
-        return {"url": self._daemon.url}
+        return self._daemon.url
 
     def _do_start(self) -> None:
         if self._daemon is not None or self._config is None:
@@ -70,7 +82,7 @@ class Daemons:
             daemon.close()
 
     def _do_joints(self) -> tuple[float, float]:
-        return self._rover.true_joints(self._now_s())
+        return self._rover.true_joints(self._do_now())
 
     def _do_point(self, frame_id: str, pixel_px: list[float]) -> list[float] | None:
         try:
@@ -99,17 +111,14 @@ class Daemons:
     def _do_clear_fault(self, device: str | None, word: str | None) -> None:
         self._rover.faults.clear(device, word)
 
-    def _do_now(self) -> float:
-        return self._now_s()
-
     def _do_advance(self, duration_s: float) -> float:
         if not 0.0 <= duration_s <= 1e6:
             raise BadOptions(f"time is to advance by {duration_s} s, expected a number from 0 to 1000000")
         assert self._daemon is not None
         self._daemon.service.clock.sleep(duration_s)
-        return self._now_s()
+        return self._do_now()
 
-    def _now_s(self) -> float:
+    def _do_now(self) -> float:
         assert self._rover is not None and self._daemon is not None
         return self._daemon.service.clock.now_s()
 
@@ -202,3 +211,64 @@ def resized(model: CameraModel, width_px: int) -> CameraModel:
         H=across * model.H + (across - 1.0) / 2.0 * model.A,
         V=down * model.V + (down - 1.0) / 2.0 * model.A,
     )
+
+
+PARENT_CHECKED_S = 0.25
+
+
+def main() -> None:
+    """Serve until no client is left."""
+    parent = int(sys.argv[1])
+    threading.Thread(target=_watch, args=(parent,), name="parent watched", daemon=True).start()
+    # Whatever a driver or a library prints is not for the line of answers.
+    with os.fdopen(os.dup(0), "rb") as orders, os.fdopen(os.dup(1), "wb") as answers:
+        with Path(os.devnull).open("rb") as nothing:
+            os.dup2(nothing.fileno(), 0)
+        os.dup2(2, 1)
+        sys.stdout = sys.stderr = queued(2)  # as `mastctl run` says things
+        handler = QueuedHandler(queued(2))
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        logging.getLogger().addHandler(handler)
+        for name in ("mastctl", "drivers", "calib"):
+            logging.getLogger(name).setLevel(logging.INFO)
+        _serve(orders, answers)
+    os._exit(0)  # a simulated rover needs no orderly end, and a thread that hangs must not hold this one
+
+
+def _watch(parent: int) -> None:
+    """End with the process that made this one; the system names another parent when that is gone."""
+    controller = _parent_of(parent) if "PYTEST_XDIST_WORKER" in os.environ else None
+    while os.getppid() == parent and (controller is None or _parent_of(parent) == controller):
+        time.sleep(PARENT_CHECKED_S)
+    os._exit(1)
+
+
+def _parent_of(pid: int) -> int | None:
+    """The id of a process's parent; None if it is gone."""
+    try:
+        after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2]
+    except OSError:
+        return None
+    return int(after_name.split()[1])
+
+
+def _serve(orders: IO[bytes], answers: IO[bytes]) -> None:
+    daemons = Daemons()
+    for line in orders:
+        order: dict[str, Any] = json.loads(line)
+        try:
+            answer = {"done": daemons.do(order.pop("do"), order)}
+        except Exception as error:
+            body = error_body(error)
+            if body["code"] == "internal":
+                logging.getLogger(__name__).exception("an order failed")
+            answer = {"error": {"code": body["code"], "message": body["message"]}}
+        try:
+            answers.write(json.dumps(answer).encode() + b"\n")
+            answers.flush()
+        except OSError:
+            return
+
+
+if __name__ == "__main__":
+    main()

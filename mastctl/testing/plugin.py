@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from mastctl.client import Client
-    from mastctl.testing.process import RoverProcess
-    from mastctl.testing.rover import SetFault, SimulatedRover
+    from mastctl.testing.rover import RoverProcess, SetFault, SimulatedRover
 
 MARKER = "mastctl"
 DRIVERS = "mastctl.testing.drivers"
@@ -77,7 +77,7 @@ def _mast_process(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable
     folder, made = tmp_path_factory.mktemp("mastctl"), list[Any]()
 
     def process() -> RoverProcess:
-        from mastctl.testing.process import RoverProcess
+        from mastctl.testing.rover import RoverProcess
 
         if not made or not made[-1].alive:
             workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
@@ -97,14 +97,15 @@ def simulated_rover(
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[SimulatedRover]:
     """The simulated rover of this test, with a daemon of its own that has just started."""
-    from mastctl.testing.rover import RoverError, SimulatedRover
+    from mastctl.testing.rover import START_S, RoverError, SimulatedRover
 
     process = _mast_process()
     request.node.stash[_LOG] = (process.log, process.log.stat().st_size)
     url = refusal = ""
     try:
         options = _options(request)
-        url = process.open({**options, "folder": str(tmp_path_factory.mktemp("rover"))})
+        folder = str(tmp_path_factory.mktemp("rover"))
+        url = process.request("open", START_S, **options, folder=folder)
     except (RoverError, ValueError) as error:
         refusal = str(error)
     if refusal:
@@ -139,19 +140,17 @@ def fault(simulated_rover: SimulatedRover) -> Callable[..., SetFault]:
 
 def _options(request: pytest.FixtureRequest) -> dict[str, Any]:
     """The options of the marker and the project's configuration. Raises ValueError."""
-    ini = {name.removeprefix("mastctl_"): str(request.config.getini(name)).strip() for name in INI}
-    wanted: dict[str, Any] = {"config": ini["config"] or None}
-    wanted["picture_width_px"] = _number("picture_width_px", ini, USUAL_WIDTH_PX, AS_CONFIGURED)
-    for name, word in (("speed", "max"), ("seed", None), ("samples", None)):
-        if ini[name]:
-            wanted[name] = _number(name, ini, 0, word)
+    wanted: dict[str, Any] = {"config": None, "picture_width_px": USUAL_WIDTH_PX}
+    for name in INI:
+        if text := str(request.config.getini(name)).strip():
+            wanted[name.removeprefix("mastctl_")] = _value(text)
     for marker in reversed([*request.node.iter_markers(MARKER)]):  # the closest one last
         if marker.args:
             raise ValueError(f"the marker {MARKER} takes keywords only, found {marker.args[0]!r}")
         wanted |= marker.kwargs
     config, width_px = wanted.pop("config"), wanted.pop("picture_width_px")
     if config is not None:
-        config = str(request.config.rootpath / config)
+        config = str(request.config.rootpath / str(config))
     return {
         "config": config,
         "picture_width_px": None if width_px == AS_CONFIGURED else width_px,
@@ -159,13 +158,9 @@ def _options(request: pytest.FixtureRequest) -> dict[str, Any]:
     }
 
 
-def _number(name: str, ini: dict[str, str], usual: int, word: str | None) -> int | float | str:
-    """A number of the project's configuration, or the one word that may stand for it."""
-    text = ini[name]
-    if not text or text == word:
-        return text or usual
-    try:
-        return int(text) if text.isascii() and text.isdigit() else float(text)
-    except ValueError:
-        expected = "a number" if word is None else f"a number or {word}"
-        raise ValueError(f"mastctl_{name} is '{text}', expected {expected}") from None
+def _value(text: str) -> int | float | str:
+    """A number of the project's configuration, or another text; what reads it judges it."""
+    for kind in (int, float):
+        with suppress(ValueError):
+            return kind(text)
+    return text

@@ -18,7 +18,7 @@ from mastctl.testing.daemons import config_for_a_test
 HOLDER = """
 import os, sys, threading, time
 from pathlib import Path
-from mastctl.testing.process import RoverProcess
+from mastctl.testing.rover import RoverProcess
 
 made = []
 maker = threading.Thread(target=lambda: made.append(RoverProcess(Path(sys.argv[1]))))
@@ -73,7 +73,7 @@ def test_its_process_ends_when_the_one_that_made_it_is_killed(
     holder: tuple[subprocess.Popen[str], list[int]],
 ) -> None:
     made, pids = holder
-    serving = [pid for pid in pids if b"mastctl.testing.serve" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    serving = [pid for pid in pids if b"mastctl.testing.daemons" in Path(f"/proc/{pid}/cmdline").read_bytes()]
     assert len(serving) == 1
     made.kill()
     until(lambda: not runs(serving[0]), "its end")
