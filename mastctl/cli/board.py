@@ -30,7 +30,7 @@ OPTIONS_OF = {
 @command(
     "board make",
     option("--kind charuco|aprilgrid|dots|checkerboard", "the pattern", required=True),
-    option("--out FILE", "board.pdf or board.svg; its BOARD.yaml is written beside it", required=True),
+    option("--out FILE", "board.pdf; its BOARD.yaml is written beside it", required=True),
     option("--paper SIZE", "A4, A3, A2, letter, ..., or WxH in mm: 500x700", default="A4"),
     option("--landscape", "the paper lies on its longer side"),
     option("--columns N", "as many as fit, if left out"),
@@ -50,17 +50,17 @@ OPTIONS_OF = {
 def _make(args: argparse.Namespace) -> Answer:
     from calib.files import save_bytes
     from calib.targets.board_file import save_board
-    from mastctl.setup.board_sheet import pdf_of, sheet_of, svg_of
+    from mastctl.setup.board_sheet import pdf_of, sheet_of
 
     out = args.out
-    if out.suffix not in (".pdf", ".svg"):
-        raise WrongUse(f"--out: {args.out} where a file ending in .pdf or .svg is expected")
+    if out.suffix != ".pdf":
+        raise WrongUse(f"--out: {args.out} where a file ending in .pdf is expected")
     paper_mm = _paper_mm(args)
     board = _board(args, paper_mm)
     sheet = sheet_of(board, paper_mm, out.stem)
     yaml = out.with_suffix(".yaml")
     _check_free(yaml)
-    save_bytes(out, pdf_of(sheet) if out.suffix == ".pdf" else svg_of(sheet))
+    save_bytes(out, pdf_of(sheet))
     save_board(yaml, board, sheet.bar_m, out.stem)
     return _written(yaml, [out, yaml, name_schema(yaml, "board")], sheet.bar_m)
 

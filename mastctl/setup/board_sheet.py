@@ -6,7 +6,6 @@ import math
 import zlib
 from dataclasses import dataclass
 from itertools import pairwise
-from xml.sax.saxutils import escape
 
 from calib.targets.boards import AnyBoard, AprilGrid, Charuco, Checkerboard, DotBoard
 from calib.targets.pattern import Spots, pattern_of
@@ -54,7 +53,6 @@ class Sheet:
     rectangles: tuple[Rectangle, ...]
     ellipses: tuple[Rectangle, ...]
     lines: tuple[TextLine, ...]
-    board: AnyBoard
     middle_mm: tuple[float, float]
     bar_m: tuple[float, float]
 
@@ -78,9 +76,7 @@ def sheet_of(board: AnyBoard, paper_mm: tuple[float, float], name: str) -> Sheet
     width_mm, height_mm = (1000.0 * size for size in board.size_m)
     wide_mm, high_mm = largest_mm(paper_mm)
     if width_mm > wide_mm + 1e-6 or height_mm > high_mm + 1e-6:
-        key = {"charuco": "square", "checkerboard": "square", "aprilgrid": "tag", "dots": "spacing"}[
-            board.kind
-        ]
+        key = {"aprilgrid": "tag", "dots": "spacing"}.get(board.kind, "square")
         part = min(wide_mm / width_mm, high_mm / height_mm)
         fits_mm = math.floor(10_000.0 * part * getattr(board, f"{key}_m")) / 10
         raise TooLarge(
@@ -98,11 +94,7 @@ def sheet_of(board: AnyBoard, paper_mm: tuple[float, float], name: str) -> Sheet
     texts = (
         (6.0, TEXT_MM, description(board)),
         (10.5, SMALL_MM, f"mastctl board {name}    this side up, x to the right, y down, z into the paper"),
-        (
-            14.5,
-            SMALL_MM,
-            f"Print at 100 % (no fit to page), glue flat. Write the bars' lengths into {name}.yaml:",
-        ),
+        (14.5, SMALL_MM, "Print at 100 % (no fit to page), glue flat. Write the lengths of the bars:"),
         (18.5, SMALL_MM, f"mastctl board measured {name}.yaml --across-mm ... --down-mm ..."),
     )
     lines = [
@@ -110,41 +102,33 @@ def sheet_of(board: AnyBoard, paper_mm: tuple[float, float], name: str) -> Sheet
         TextLine(side - 1.2, top + down_mm / 2 + 20.0, SMALL_MM, f"{down_mm:g} mm down: measure it", True),
         *(TextLine(left, foot + below_mm, height_mm, text) for below_mm, height_mm, text in texts),
     ]
-    bars += _up(left + width_mm - 3.0, foot + 4.0)
-    return Sheet(
-        paper_mm,
-        tuple(rectangles + bars),
-        tuple(ellipses),
-        tuple(lines),
-        board,
-        middle,
-        (across_mm / 1000, down_mm / 1000),
-    )
+    bar_m = across_mm / 1000, down_mm / 1000
+    return Sheet(paper_mm, (*rectangles, *bars), tuple(ellipses), tuple(lines), middle, bar_m)
 
 
 def description(board: AnyBoard) -> str:
     """Return the kind and measures of a board, in one line."""
+    across = f"{board.columns} x {board.rows}"
     match board:
         case Charuco():
             old = ", drawn as before OpenCV 4.6" if board.legacy else ""
-            ids = f" from {board.first_id}" if board.first_id else ""
             return (
-                f"ChArUco, {board.columns} x {board.rows} squares of {_mm(board.square_m)} mm, "
-                f"markers of {_mm(board.marker_m)} mm, {board.dictionary}{ids}{old}"
+                f"ChArUco, {across} squares of {_mm(board.square_m)} mm, "
+                f"markers of {_mm(board.marker_m)} mm, {board.dictionary}{_ids(board.first_id)}{old}"
             )
         case AprilGrid():
-            ids = f" from {board.first_id}" if board.first_id else ""
             return (
-                f"AprilGrid, {board.columns} x {board.rows} tags of {_mm(board.tag_m)} mm, "
-                f"{_mm(board.gap_m)} mm apart, {board.family}{ids}"
+                f"AprilGrid, {across} tags of {_mm(board.tag_m)} mm, "
+                f"{_mm(board.gap_m)} mm apart, {board.family}{_ids(board.first_id)}"
             )
         case DotBoard():
-            return (
-                f"Dots, {board.columns} x {board.rows}, {_mm(board.spacing_m)} mm apart, "
-                f"{_mm(board.dot_diameter_m)} mm across"
-            )
+            return f"Dots, {across}, {_mm(board.spacing_m)} mm apart, {_mm(board.dot_diameter_m)} mm across"
         case Checkerboard():
-            return f"Chessboard, {board.columns} x {board.rows} squares of {_mm(board.square_m)} mm"
+            return f"Chessboard, {across} squares of {_mm(board.square_m)} mm"
+
+
+def _ids(first: int) -> str:
+    return f" from {first}" if first else ""
 
 
 def _printed(board: AnyBoard, middle: tuple[float, float]) -> tuple[list[Rectangle], list[Rectangle]]:
@@ -152,16 +136,12 @@ def _printed(board: AnyBoard, middle: tuple[float, float]) -> tuple[list[Rectang
     pattern = pattern_of(board)
     x, y = middle
     if isinstance(pattern, Spots):
-        half = 500.0 * pattern.diameter_m
-        spots = [
-            (x + 1000.0 * a, y + 1000.0 * b, half, half * pattern.aspect)
-            for b in pattern.y_m
-            for a in pattern.x_m
-        ]
-        return [], spots
+        half, aspect = 500.0 * pattern.diameter_m, pattern.aspect
+        places = [(x + 1000.0 * a, y + 1000.0 * b) for b in pattern.y_m for a in pattern.x_m]
+        return [], [(*place, half, half * aspect) for place in places]
     cells = [
-        (x + 1000.0 * left, y + 1000.0 * top, x + 1000.0 * right, y + 1000.0 * bottom)
-        for left, top, right, bottom in pattern.rectangles_m()
+        (x + 1000.0 * a, y + 1000.0 * b, x + 1000.0 * c, y + 1000.0 * d)
+        for a, b, c, d in pattern.rectangles_m()
     ]
     return cells, []
 
@@ -178,16 +158,6 @@ def _bar(x: float, y: float, length: float, down: bool) -> list[Rectangle]:
     return [(x - (t - y), y + (a - x), x - (s - y), y + (b - x)) for a, s, b, t in (line, *ends)]
 
 
-def _up(x: float, y: float) -> list[Rectangle]:
-    """An arrow that points up, of steps, 8 mm high."""
-    steps = 24
-    head = [
-        (x - 2.0 * k / steps, y + 4.0 * k / steps, x + 2.0 * k / steps, y + 4.0 * (k + 1) / steps)
-        for k in range(1, steps)
-    ]
-    return [*head, (x - 0.5, y + 4.0, x + 0.5, y + 8.0)]
-
-
 def _mm(metres: float) -> str:
     return f"{1000.0 * metres:.3f}".rstrip("0").rstrip(".")
 
@@ -195,28 +165,6 @@ def _mm(metres: float) -> str:
 PT_PER_MM = 72 / 25.4
 DOT_POINTS = 8
 """Curves an ellipse is made of: the middle of such a dot is exact by symmetry."""
-
-
-def svg_of(sheet: Sheet) -> bytes:
-    """Return the sheet as SVG; one unit is a millimetre."""
-    width, height = sheet.size_mm
-    boxes = "".join(f"M{_n(a)} {_n(b)}H{_n(c)}V{_n(d)}H{_n(a)}Z" for a, b, c, d in sheet.rectangles)
-    spots = "\n".join(
-        f'<ellipse cx="{_n(x)}" cy="{_n(y)}" rx="{_n(rx)}" ry="{_n(ry)}"/>' for x, y, rx, ry in sheet.ellipses
-    )
-    lines = "\n".join(_svg_text(one) for one in sheet.lines)
-    paper = f'width="{_n(width)}mm" height="{_n(height)}mm" viewBox="0 0 {_n(width)} {_n(height)}"'
-    text = f"""<?xml version="1.0" encoding="UTF-8"?>
-<svg xmlns="http://www.w3.org/2000/svg" {paper}>
-<rect width="{_n(width)}" height="{_n(height)}" fill="white"/>
-<path d="{boxes}"/>
-{spots}
-<g font-family="Helvetica, Arial, sans-serif">
-{lines}
-</g>
-</svg>
-"""
-    return text.encode()
 
 
 def pdf_of(sheet: Sheet) -> bytes:
@@ -267,12 +215,6 @@ def _pdf_text(line: TextLine) -> str:
     text = line.text.replace("\\", "\\\\").replace("(", "\\(").replace(")", "\\)")
     turn = "0 -1 -1 0" if line.upwards else "1 0 0 -1"
     return f"BT /F1 {_n(line.height_mm)} Tf {turn} {_n(line.x_mm)} {_n(line.y_mm)} Tm ({text}) Tj ET"
-
-
-def _svg_text(line: TextLine) -> str:
-    x, y = _n(line.x_mm), _n(line.y_mm)
-    turn = f' transform="rotate(-90 {x} {y})"' if line.upwards else ""
-    return f'<text x="{x}" y="{y}" font-size="{_n(line.height_mm)}"{turn}>{escape(line.text)}</text>'
 
 
 def _n(value: float) -> str:
