@@ -23,7 +23,7 @@ from mastctl.devices.devices import Devices
 from mastctl.devices.judge import Limits
 from mastctl.motion.loop import PointingLoop
 from mastctl.motion.requests import PixelTarget, PointRequest
-from mastctl.setup.machine import examine_drivers
+from mastctl.setup.doctor import examine_drivers
 
 LANDED_WITHIN_PX = 0.6
 """Peak of a plain correlation to the whole pixel, and a floor seen from another side."""

@@ -52,9 +52,8 @@ def _port(text: str) -> str:
     example="rig --pan-deg -90 90 --tilt-deg -40 30",
 )
 def _new(args: argparse.Namespace) -> Answer:
-    from mastctl.setup.machine import ExaminedMachine
-    from mastctl.setup.new_folder import RIG_FILES, write_rig, write_simulated
-    from mastctl.setup.plugged import find_plugged
+    from mastctl.setup.doctor import ExaminedMachine
+    from mastctl.setup.new_folder import RIG_FILES, find_plugged, write_rig, write_simulated
     from mastctl.setup.simulated_rig import RigNumbers, check_free
 
     check_folder(args.folder, "FOLDER")

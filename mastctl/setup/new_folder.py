@@ -1,14 +1,16 @@
-"""The folder of a new rig: configuration, drawing, udev rules, schemas for editors, and what to do next.
+"""``rig new``: what is plugged in, and the folder of a new rig made of it, with what to do next.
 
-Nothing that is there is ever replaced. Without any hardware the folder holds the simulated twin, which runs.
+Heads that answer on serial lines and cameras are found by their drivers; nothing moves. Nothing that is there
+is ever replaced. Without any hardware the folder holds the simulated twin, which runs.
 """
 
 from __future__ import annotations
 
 import math
+import os
 import re
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -19,17 +21,27 @@ from typing import Any
 import numpy as np
 
 from calib.files import save_bytes
-from calib.files.mast_file import MAST_SCHEMA, load_rig
+from calib.files.mast_file import load_rig, save_rig
 from calib.files.yaml_text import dump_mapping
+from calib.geometry.rig import Mast, Rig, RigCamera
+from drivers.errors import DriverError
 from drivers.faults import PAN_TILT
 from drivers.registry import ProbedCamera, ProbedHead, driver_of, drivers_of
 from drivers.servo_bus.bench import USUAL_BAUD, ServoBench, ServosOnLine
 from drivers.sim.heads import DEFAULT_HEADS
 from mastctl.config import CONFIG_SCHEMA, check_cameras, load_config
 from mastctl.packaged import SCHEMAS, config_folder, name_schema
-from mastctl.setup.machine import ExaminedMachine
-from mastctl.setup.plugged import Plugged, lone_servo, usb_of
-from mastctl.setup.simulated_rig import CONFIG, MAST, TRUE_RIG, RigNumbers, built_rig, check_free, write_built
+from mastctl.setup.doctor import ExaminedMachine, examine_port, serial_lines
+from mastctl.setup.simulated_rig import (
+    CONFIG,
+    MAST,
+    TRUE_RIG,
+    RigNumbers,
+    built_rig,
+    camera_ahead,
+    check_free,
+    write_built,
+)
 
 RULES, README = "60-mastctl.rules", "README.md"
 RIG_FILES = (CONFIG, MAST, TRUE_RIG, RULES, README, SCHEMAS)
@@ -48,12 +60,98 @@ SLOW = (
     f"`--new-baud {USUAL_BAUD}` raises it; then write `baud: {USUAL_BAUD}` and take `poll_hz` out of {CONFIG}"
 )
 TWIN_SIZE_PX, TWIN_SEED = (640, 480), 1
-FORWARD_M, DOWN_M = 0.04, 0.02
-"""Of the drawn cameras from the meeting point of the axes."""
 MARGIN_RAD = 0.1
 """Between the limits that a head's driver holds and the soft ones."""
 _NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
 _USB = re.compile(rf"{_NUMBERED.pattern}|/dev/serial/by-.*")
+MOST_CAMERAS = 2
+NO_POWER = "; is its power on?"
+BY_HAND = "write it into configuration and mast file by hand (configs/rigs/rover.yaml has six)"
+
+
+def missing_servo(head: ProbedHead | None) -> tuple[str, str]:
+    """Return a sentence about a head's second servo, if that is missing, and the command that numbers one."""
+    if not isinstance(head, ServosOnLine) or len(head.driven) != 1:
+        return "", ""
+    (servo,) = head.driven.values()
+    sentence = f"{head.port}: only one servo answers (id {servo.servo_id}), and a head has two"
+    if servo.servo_id != 1:
+        return f"{sentence}; is the other one connected, with power and the same rate?", ""
+    bench, port, baud = head.bench, head.port, servo.baud
+    return f"{sentence}: {bench.one_id(port, baud)}", bench.numbering(port, baud)
+
+
+@dataclass(frozen=True)
+class Plugged:
+    """All that was found, and a sentence for each line or camera that is of no use, with the reason."""
+
+    heads: tuple[ProbedHead, ...] = ()
+    cameras: tuple[ProbedCamera, ...] = ()
+    unused: tuple[str, ...] = ()
+
+    @property
+    def summaries(self) -> list[str]:
+        """A sentence for each head and camera."""
+        return [*(one.summary for one in self.heads), *(one.summary for one in self.cameras)]
+
+
+def find_plugged(ports: Sequence[str], machine: ExaminedMachine, say: Callable[[str], None]) -> Plugged:
+    """Query the given serial lines, or every USB adapter, and all cameras.
+
+    ``say`` gets what is being queried; a line takes some seconds.
+    """
+    heads: list[ProbedHead] = []
+    unused: list[str] = []
+    named = [port if "://" in port else str(Path(port).absolute()) for port in ports]
+    for port in named or serial_lines(machine):
+        say(f"asking {port}")
+        found, why = query_line(port, machine)
+        if found is None:
+            unused.append(why)
+        elif not found.usable:
+            unused.append(found.summary)
+        else:
+            heads.append(found)
+            unused += [sentence] if (sentence := missing_servo(found)[0]) else []
+    say("asking the cameras")
+    cameras, no_cameras = query_cameras()
+    for one in cameras[MOST_CAMERAS:]:
+        unused.append(f"{one.summary}: a head has {MOST_CAMERAS} cameras at most here; {BY_HAND}")
+    return Plugged(tuple(heads), tuple(cameras[:MOST_CAMERAS]), (*unused, *no_cameras))
+
+
+def query_line(port: str, machine: ExaminedMachine) -> tuple[ProbedHead | None, str]:
+    """Return what answers on a line, or None and why nothing does; a line in use is left alone."""
+    path = port if "://" in port else str(machine.at(port))
+    pseudo = os.path.realpath(path).startswith("/dev/pts/")  # both its ends are open in the program behind it
+    for finding in examine_port(port, machine):
+        if finding.level == "bad" or (finding.what == "port in use" and not pseudo):
+            return None, f"{finding.sentence}; {finding.advice}"
+    reasons = []
+    for probe in head_probes():
+        try:
+            found, reason = probe(port, path)
+        except DriverError as error:
+            return None, str(error)
+        if found is not None:
+            return found, ""
+        reasons += [f"; {reason}"] if reason else []
+    return None, f"{port}: no head answers{reasons[-1] if reasons else NO_POWER}"
+
+
+def head_probes() -> list[Callable[[str, str], tuple[ProbedHead | None, str]]]:
+    """Return what queries a line for the heads of each installed driver."""
+    return [driver.probe for driver in drivers_of("head").values() if driver.probe is not None]
+
+
+def query_cameras() -> tuple[list[ProbedCamera], list[str]]:
+    """Return the cameras with a format that is read, and a sentence for each of the others."""
+    probed = [driver.probe() for driver in drivers_of("camera").values() if driver.probe is not None]
+    cameras = [camera for found, _, _ in probed for camera in found]
+    others = [sentence for _, unread, _ in probed for sentence in unread]
+    if not cameras:
+        others += [f"no camera was found; {lacks}" for _, _, lacks in probed if lacks]
+    return cameras, others
 
 
 @dataclass(frozen=True)
@@ -72,33 +170,26 @@ def write_rig(
 
     Raises InTheWay, and BadFile or BadOptions if the numbers make no rig.
     """
-    cameras = list(plugged.cameras)
     port = LINE if head is None or _NUMBERED.fullmatch(head.port) else head.port
-    name = re.sub(r"\W+", "_", folder.resolve().name) or "rig"
-    servos = head is None or isinstance(head, ServosOnLine)
-    note = f"{_CONFIG_NOTE}{_SERVO_NOTE if servos else _HEAD_NOTE}"
-    names = camera_names(len(cameras))
-    known = [tuple(_usb_of(camera, machine)) for camera in cameras]
+    names = camera_names(plugged)
+    known = [_usb_of(_device(camera, machine)) for camera in plugged.cameras]
     alike = [name for name, one in zip(names, known, strict=True) if one and known.count(one) > 1]
     notes = [f"{' and '.join(alike)} {SAME_SERIAL}"] if alike else []
     notes += [NO_HEAD] if head is None else []
-    slow = []  # of the README alone: the rig runs
     if isinstance(head, ServosOnLine) and len(head.driven) > 1 and head.bauds[0] < USUAL_BAUD:
-        slow.append(SLOW.format(baud=head.bauds[0]))
-    steps = _steps(folder, head, len(cameras))
+        notes.append(SLOW.format(baud=head.bauds[0]))
+    steps = _steps(folder, head, len(names))
+    note = _SERVO_NOTE if head is None or isinstance(head, ServosOnLine) else _HEAD_NOTE
     files = {
-        CONFIG: note.encode() + dump_mapping(configuration(head, cameras, numbers, port)),
-        MAST: _MAST_NOTE.encode() + dump_mapping(drawing(name, cameras, numbers)),
+        CONFIG: f"{_CONFIG_NOTE}{note}".encode() + dump_mapping(configuration(head, plugged, numbers, port)),
         RULES: rules(head, plugged, machine, alike).encode(),
-        README: _readme(plugged, steps, [*notes, *slow]),
+        README: _readme(plugged, steps, notes),
     }
     with _all_or_nothing(folder) as draft:
+        save_rig(drawing(re.sub(r"\W+", "_", folder.resolve().name) or "rig", plugged, numbers), draft / MAST)
+        save_bytes(draft / MAST, _MAST_NOTE.encode() + (draft / MAST).read_bytes())
         made = _written(draft, files, steps)
-        device = load_config(draft / CONFIG).hardware.pan_tilt
-        read_options = driver_of("head", device.driver, PAN_TILT).read_options
-        if read_options is not None:
-            read_options(device.options)
-    return replace(made, notes=tuple(notes))
+    return replace(made, files=(CONFIG, MAST, *made.files[1:]), notes=tuple(notes))
 
 
 def write_simulated(folder: Path, plugged: Plugged, numbers: RigNumbers) -> NewRigFolder:
@@ -146,16 +237,20 @@ def _written(folder: Path, files: Mapping[str, bytes], steps: tuple[str, ...]) -
         name_schema(folder / name, kind)
     config = load_config(folder / CONFIG)
     check_cameras(config, load_rig(config.mast_file).rig)
+    head = config.hardware.pan_tilt
+    if (read_options := driver_of("head", head.driver, PAN_TILT).read_options) is not None:
+        read_options(head.options)
     return NewRigFolder((*files, *(f"{SCHEMAS}/{kind}.json" for _, kind in kinds)), steps)
 
 
-def camera_names(count: int) -> list[str]:
+def camera_names(plugged: Plugged) -> list[str]:
     """Return the names of a rig's cameras: a pair, or one."""
+    count = len(plugged.cameras)
     return ["cam_left", "cam_right"] if count > 1 else ["cam"][:count]
 
 
 def configuration(
-    head: ProbedHead | None, cameras: list[ProbedCamera], numbers: RigNumbers, port: str
+    head: ProbedHead | None, plugged: Plugged, numbers: RigNumbers, port: str
 ) -> dict[str, Any]:
     """Return the configuration; without a head, that of two usual servos which are still to be plugged in.
 
@@ -173,7 +268,7 @@ def configuration(
         "pan_tilt": {"driver": head.driver, "options": {"port": port, **options}},
         "cameras": {
             name: {"driver": camera.driver, "options": dict(camera.options)}
-            for name, camera in zip(camera_names(len(cameras)), cameras, strict=False)
+            for name, camera in zip(camera_names(plugged), plugged.cameras, strict=True)
         },
         "limits": {
             **{f"{axis}_rad": _soft(of_axis) for axis, of_axis in reached.items()},
@@ -191,36 +286,25 @@ def _soft(ends: tuple[float, float]) -> list[float]:
     return [round(ends[0] + MARGIN_RAD, 3), round(ends[1] - MARGIN_RAD, 3)]
 
 
-def drawing(name: str, cameras: list[ProbedCamera], numbers: RigNumbers) -> dict[str, Any]:
-    """Return the mast file: axes that meet over the rover's origin, and cameras that look ahead."""
-    names = camera_names(len(cameras))
-    drawn = {}
-    for index, (camera, plugged) in enumerate(zip(names, cameras, strict=False)):
-        width, height = plugged.options["size_px"]
+def drawing(name: str, plugged: Plugged, numbers: RigNumbers) -> Rig:
+    """Return the rig as drawn: axes that meet over the rover's origin, and cameras that look ahead."""
+    names = camera_names(plugged)
+    cameras = {}
+    for side, camera, found in zip((-0.5, 0.5), names, plugged.cameras, strict=False):
+        width, height = found.options["size_px"]
         focal_px = round(numbers.focal_px(width), 1)
-        y_m = (index - 0.5) * numbers.baseline_m if len(names) == 2 else 0.0
-        drawn[camera] = {
-            "on": "head",
-            "size_px": [width, height],
-            "model": "CAHVOR",
-            "C": [FORWARD_M, y_m, DOWN_M],
-            "A": [1.0, 0.0, 0.0],
-            "H": [(width - 1) / 2, focal_px, 0.0],
-            "V": [(height - 1) / 2, 0.0, focal_px],
-            "O": [1.0, 0.0, 0.0],
-            "R": [0.0, 0.0, 0.0],
-        }
-    return {
-        "schema": MAST_SCHEMA,
-        "name": name,
-        "mast": {"translation_m": [0.0, 0.0, -numbers.height_m], "rotation_rad": [0.0, 0.0, 0.0]},
-        "cameras": drawn,
-        **({"stereo": {"cam": names}} if len(names) == 2 else {}),
-        "provenance": {
+        y_m = side * numbers.baseline_m if len(names) == 2 else 0.0
+        cameras[camera] = RigCamera("head", camera_ahead((width, height), (focal_px, focal_px), y_m))
+    return Rig(
+        name,
+        Mast(np.array([0.0, 0.0, -numbers.height_m]), np.zeros(3)),
+        cameras,
+        {"cam": (names[0], names[1])} if len(names) == 2 else {},
+        provenance={
             "kind": "drawn by mastctl rig new, not calibrated",
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
         },
-    }
+    )
 
 
 _CONFIG_NOTE = """\
@@ -241,13 +325,26 @@ _MAST_NOTE = """\
 """
 
 
-def _usb_of(
-    camera: ProbedCamera, machine: ExaminedMachine, by_socket: bool = False
-) -> Iterator[tuple[str, str]]:
-    """What singles out a camera's node for udev; nothing for a camera without one."""
-    if camera.node is None:
-        return iter(())
-    return usb_of(machine.at("/sys/class/video4linux") / camera.node.name / "device", machine, by_socket)
+def _usb_of(device: Path, by_socket: bool = False) -> list[str]:
+    """The udev matches that single out a USB device: by its serial number, else its socket.
+
+    ``device`` is its folder in sysfs; nothing is returned for what is not on USB. ``by_socket``: where others
+    have the same serial number.
+    """
+    place = device.resolve()
+    folder = next((one for one in (place, *place.parents) if (one / "idVendor").is_file()), None)
+    if folder is None:
+        return []
+    names = ("idVendor", "idProduct") if by_socket else ("idVendor", "idProduct", "serial")
+    found = {name: (folder / name).read_text().strip() for name in names if (folder / name).is_file()}
+    matches = [f'ATTRS{{{name}}}=="{value}"' for name, value in found.items()]
+    return matches if "serial" in found else [*matches, f'KERNELS=="{folder.name}"']
+
+
+def _device(camera: ProbedCamera, machine: ExaminedMachine) -> Path:
+    """A camera's folder in sysfs; that of none for a camera without a node."""
+    node = "none" if camera.node is None else camera.node.name
+    return machine.at("/sys/class/video4linux") / node / "device"
 
 
 def rules(
@@ -258,21 +355,20 @@ def rules(
     ``alike`` are cameras of one serial number.
     """
     text = (config_folder() / "udev" / RULES).read_text(encoding="utf-8")
-    lines = ["", "# This rig:"]
+    lines = []
     if head is not None and "://" not in head.port:
         device = machine.at("/sys/class/tty") / machine.at(head.port).resolve().name / "device"
-        lines += _rule('SUBSYSTEM=="tty", SUBSYSTEMS=="usb"', list(usb_of(device, machine)), LINE[5:])
-    for name, camera in zip(camera_names(len(plugged.cameras)), plugged.cameras, strict=False):
+        lines += _rule('SUBSYSTEM=="tty", SUBSYSTEMS=="usb"', _usb_of(device), LINE[5:])
+    for name, camera in zip(camera_names(plugged), plugged.cameras, strict=True):
+        matches = _usb_of(_device(camera, machine), by_socket=name in alike)
         about = 'SUBSYSTEM=="video4linux", ATTR{index}=="0"'
-        matches = list(_usb_of(camera, machine, by_socket=name in alike))
         lines += _rule(about, matches, f"v4l/by-id/mast-{name.replace('_', '-')}")
-    return text + "\n".join(lines) + "\n" if len(lines) > 2 else text
+    return "\n".join([text, "# This rig:", *lines, ""]) if lines else text
 
 
-def _rule(about: str, matches: Sequence[tuple[str, str]], name: str) -> list[str]:
+def _rule(about: str, matches: Sequence[str], name: str) -> list[str]:
     """One line of a rule, if there is something to know the device by."""
-    keys = "".join(f', {key}=="{value}"' for key, value in matches)
-    return [f'{about}{keys}, SYMLINK+="{name}"'] if matches else []
+    return [f'{", ".join([about, *matches])}, SYMLINK+="{name}"'] if matches else []
 
 
 def _steps(folder: Path, head: ProbedHead | None, cameras: int) -> tuple[str, ...]:
@@ -285,10 +381,8 @@ def _steps(folder: Path, head: ProbedHead | None, cameras: int) -> tuple[str, ..
     point = f"mastctl point {config} --angles 0.2 0.0"
     by_rule = _USB.fullmatch(head.port) or cameras
     steps = (f"{rules} && sudo udevadm trigger", doctor, run) if by_rule else (doctor, run, point)
-    lone = lone_servo(head)
-    if lone is not None and lone[1].servo_id == 1:
-        return lone[0].numbering(head.port, lone[1].baud), *steps[:2]
-    return steps
+    numbering = missing_servo(head)[1]
+    return (numbering, *steps[:2]) if numbering else steps
 
 
 def _readme(plugged: Plugged, steps: Sequence[str], notes: Sequence[str] = ()) -> bytes:

@@ -91,6 +91,29 @@ class RigNumbers:
         return width_px / 2.0 / math.tan(math.radians(self.view_deg) / 2.0)
 
 
+def camera_ahead(
+    size_px: tuple[int, int], focal_px: tuple[float, float], y_m: float, middle_px: FloatArray | None = None
+) -> CameraModel:
+    """Return a camera of a drawing, in the head frame: it looks along x, without distortion.
+
+    ``focal_px`` are across and down, ``y_m`` is its place to the right, ``middle_px`` (2,) that of the image
+    by default.
+    """
+    if middle_px is None:
+        middle_px = (np.array(size_px) - 1) / 2
+    ahead, right, down = np.eye(3)
+    return CameraModel(
+        kind="CAHVOR",
+        size_px=size_px,
+        C=np.array([FORWARD_M, y_m, DOWN_M]),
+        A=ahead,
+        H=focal_px[0] * right + middle_px[0] * ahead,
+        V=focal_px[1] * down + middle_px[1] * ahead,
+        O=ahead,
+        R=np.zeros(3),
+    )
+
+
 def built_rig(numbers: RigNumbers, rng: np.random.Generator) -> Rig:
     """Return the rig as a workshop builds it: mast and cameras a little off what the drawing says."""
     mast = Mast(
@@ -99,36 +122,25 @@ def built_rig(numbers: RigNumbers, rng: np.random.Generator) -> Rig:
     )
     half_m = numbers.baseline_m / 2.0
     cameras = {
-        f"navcam_{side}": RigCamera("head", _built_camera(numbers, np.array([FORWARD_M, y_m, DOWN_M]), rng))
+        f"navcam_{side}": RigCamera("head", _built_camera(numbers, y_m, rng))
         for side, y_m in (("left", -half_m), ("right", half_m))
     }
     return Rig(NAME, mast, cameras, {"navcam": ("navcam_left", "navcam_right")})
 
 
-def _built_camera(numbers: RigNumbers, place_m: FloatArray, rng: np.random.Generator) -> CameraModel:
-    """One camera that looks ahead along x of the head."""
+def _built_camera(numbers: RigNumbers, y_m: float, rng: np.random.Generator) -> CameraModel:
+    """One camera of the drawing, with the errors of its making."""
     width, height = numbers.size_px
-    focal_px = numbers.focal_px(width) * (1.0 + BUILT_FOCAL * rng.standard_normal())
-    across_px = focal_px * (1.0 + BUILT_ASPECT * rng.standard_normal())
-    middle_px = np.array([(width - 1) / 2, (height - 1) / 2])
-    middle_px = middle_px + BUILT_MIDDLE * width * rng.standard_normal(2)
-    ahead, right, down = np.eye(3)
-    lens_axis = ahead + np.array([0.0, *(BUILT_LENS_AXIS_RAD * rng.standard_normal(2))])
+    down_px = numbers.focal_px(width) * (1.0 + BUILT_FOCAL * rng.standard_normal())
+    across_px = down_px * (1.0 + BUILT_ASPECT * rng.standard_normal())
+    middle_px = np.array([width - 1, height - 1]) / 2 + BUILT_MIDDLE * width * rng.standard_normal(2)
+    drawn = camera_ahead(numbers.size_px, (across_px, down_px), y_m, middle_px)
+    lens_axis = drawn.A + np.array([0.0, *(BUILT_LENS_AXIS_RAD * rng.standard_normal(2))])
     bends = [usual + sigma * rng.standard_normal() for usual, sigma in LENS]
-    model = CameraModel(
-        kind="CAHVOR",
-        size_px=numbers.size_px,
-        C=np.zeros(3),
-        A=ahead,
-        H=across_px * right + middle_px[0] * ahead,
-        V=focal_px * down + middle_px[1] * ahead,
-        O=lens_axis / np.linalg.norm(lens_axis),
-        R=np.array([0.0, *bends]),
-    )
+    lens = replace(drawn, O=lens_axis / np.linalg.norm(lens_axis), R=np.array([0.0, *bends]))
     x, y, z = BUILT_ANGLE_RAD * rng.standard_normal(3)
-    return model.moved(
-        Rigid(rot_x(x) @ rot_y(y) @ rot_z(z), place_m + BUILT_PLACE_M * rng.standard_normal(3))
-    )
+    turn = rot_x(x) @ rot_y(y) @ rot_z(z)
+    return lens.moved(Rigid(turn, drawn.C - turn @ drawn.C + BUILT_PLACE_M * rng.standard_normal(3)))
 
 
 def check_free(folder: Path, names: Sequence[str] = (CONFIG, MAST, TRUE_RIG)) -> None:

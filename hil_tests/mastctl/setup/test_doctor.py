@@ -10,9 +10,8 @@ import pytest
 
 from mastctl.config import load_config
 from mastctl.packaged import default_config
-from mastctl.setup import machine as this_machine
-from mastctl.setup.doctor import examine, examine_mast_file
-from mastctl.setup.machine import DoctorFinding, ExaminedMachine
+from mastctl.setup import doctor as this_machine
+from mastctl.setup.doctor import DoctorFinding, ExaminedMachine, examine, examine_mast_file
 
 PORT = "/dev/ttyUSB0"
 

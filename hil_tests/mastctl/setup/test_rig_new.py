@@ -37,11 +37,10 @@ from drivers.v4l2.settings import parse_options
 from mastctl.cli.main import main
 from mastctl.config import load_config
 from mastctl.packaged import schema_files
-from mastctl.setup import doctor, plugged
+from mastctl.setup import doctor
 from mastctl.setup import new_folder as folder_module
-from mastctl.setup.machine import ExaminedMachine
-from mastctl.setup.new_folder import README, RULES, write_rig
-from mastctl.setup.plugged import Plugged, head_probes
+from mastctl.setup.doctor import ExaminedMachine
+from mastctl.setup.new_folder import README, RULES, Plugged, head_probes, write_rig
 from mastctl.setup.simulated_rig import CONFIG, MAST, RigNumbers
 
 X = PRESETS["dynamixel_x"]
@@ -74,8 +73,8 @@ class Bench:
         line = MemoryLine(device, self.clock)
         asked = {"clock": self.clock, "open_line": lambda port, *rest: line.open(line.path, *rest)}
         probes = [partial(probe, **asked) for probe in HEAD_PROBES]
-        self._patch.setattr(plugged, "head_probes", lambda: probes)
-        self._patch.setattr(plugged, "examine_port", lambda port, machine: ())
+        self._patch.setattr(folder_module, "head_probes", lambda: probes)
+        self._patch.setattr(folder_module, "examine_port", lambda port, machine: ())
         with self.clock.at_work(), line:
             yield "/dev/ttyMemory"
 
@@ -83,8 +82,8 @@ class Bench:
 @pytest.fixture
 def nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine into which nothing is plugged."""
-    monkeypatch.setattr(plugged, "serial_lines", lambda machine: [])
-    monkeypatch.setattr(plugged, "query_cameras", lambda: ([], []))
+    monkeypatch.setattr(folder_module, "serial_lines", lambda machine: [])
+    monkeypatch.setattr(folder_module, "query_cameras", lambda: ([], []))
 
 
 @pytest.fixture
