@@ -191,7 +191,7 @@ def _new_simulated(args: argparse.Namespace) -> Answer:
     rows = [(name, f"{px:.2f}") for name, px in twin.apart_px.items()]
     shown: list[str | Shown] = [Shown("what the mast file is off by", ("camera", "at most, px at 5 m"), rows)]
     if twin.by != "fit.covariance":
-        from mastctl.setup.true_twin import STATED
+        from mastctl.setup.simulated_rig import STATED
 
         shown.append(f"drawn by {twin.by}, since no covariance is known: {STATED}")
     shown.append(f"run it: mastctl run --config {config}; or at once: mastctl demo --config {config}")

@@ -14,7 +14,7 @@ from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.rigid import tangents
 from mastctl.cli.main import main
 from mastctl.config import load_config
-from mastctl.setup.true_twin import true_twin
+from mastctl.setup.simulated_rig import true_twin
 
 FILES = ("config.yaml", "mast.yaml", "true_rig.yaml")
 
