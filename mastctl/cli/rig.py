@@ -160,10 +160,11 @@ WIRE = option("--wire DRIVER", "drive the head through bytes by its real driver"
 def _new_simulated(args: argparse.Namespace) -> Answer:
     import numpy as np
 
+    from calib.files.mast_file import load_rig
     from drivers.hardware import DeviceSettings, HardwareSettings, clock_for
     from drivers.sim.heads import DEFAULT_HEADS, check_head, head_settings
     from mastctl.packaged import driver_of_hardware
-    from mastctl.setup.simulated_rig import RigNumbers, built_rig, check_free, write_built, write_twin
+    from mastctl.setup.simulated_rig import RigNumbers, built_rig, check_free, write_rover
 
     simulation: dict[str, Any] = {"seed": args.seed, "samples": 2}
     simulation |= {
@@ -179,11 +180,11 @@ def _new_simulated(args: argparse.Namespace) -> Answer:
     check_folder(args.folder, "FOLDER")
     check_free(args.folder)
     if args.mast_file is not None:
-        twin = write_twin(args.mast_file, args.folder, simulation, args.seed)
+        rig = load_rig(args.mast_file).rig
     else:
         numbers = RigNumbers(args.height, args.baseline, args.view_deg, args.size)
         rig = built_rig(numbers, np.random.default_rng([args.seed, 1]))
-        twin = write_built(rig, args.folder, simulation, args.seed)
+    twin = write_rover(rig, args.folder, simulation, args.seed, mast_file=args.mast_file)
     config = args.folder / "config.yaml"
     document = {
         "config": str(config), "cameras": list(twin.apart_px), "drawn_by": twin.by, "apart_px": twin.apart_px

@@ -40,7 +40,7 @@ from mastctl.setup.simulated_rig import (
     built_rig,
     camera_ahead,
     check_free,
-    write_built,
+    write_rover,
 )
 
 RULES, README = "60-mastctl.rules", "README.md"
@@ -205,7 +205,7 @@ def write_simulated(folder: Path, plugged: Plugged, numbers: RigNumbers) -> NewR
     )
     limits_rad = _soft(_radians(numbers.pan_deg)), _soft(_radians(numbers.tilt_deg))
     with _all_or_nothing(folder) as draft:
-        write_built(rig, draft, simulation, TWIN_SEED, limits_rad)
+        write_rover(rig, draft, simulation, TWIN_SEED, limits_rad)
         made = _written(draft, {README: _readme(plugged, steps)}, steps)
     return replace(made, files=(CONFIG, MAST, TRUE_RIG, *made.files))
 

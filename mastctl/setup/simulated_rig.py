@@ -145,7 +145,10 @@ def camera_ahead(
 
 
 def built_rig(numbers: RigNumbers, rng: np.random.Generator) -> Rig:
-    """Return the rig as a workshop builds it: mast and cameras a little off what the drawing says."""
+    """Return the rig as a workshop builds it: mast and cameras a little off what the drawing says.
+
+    It is known as well as a usual calibration leaves it.
+    """
     mast = Mast(
         np.array([0.0, 0.0, -numbers.height_m]) + BUILT_PLACE_M * rng.standard_normal(3),
         BUILT_ANGLE_RAD * rng.standard_normal(3),
@@ -155,7 +158,15 @@ def built_rig(numbers: RigNumbers, rng: np.random.Generator) -> Rig:
         f"navcam_{side}": RigCamera("head", _built_camera(numbers, y_m, rng))
         for side, y_m in (("left", -half_m), ("right", half_m))
     }
-    return Rig(NAME, mast, cameras, {"navcam": ("navcam_left", "navcam_right")})
+    rig = Rig(NAME, mast, cameras, {"navcam": ("navcam_left", "navcam_right")})
+    known = usual_covariance(rig)
+    fit = {
+        "method": "stated",
+        "stated": STATED,
+        "parameters": list(known.names),
+        "covariance": rounded_matrix(known.covariance),
+    }
+    return replace(rig, fit=fit, provenance={"kind": "made by mastctl rig sim new from numbers"})
 
 
 def _built_camera(numbers: RigNumbers, y_m: float, rng: np.random.Generator) -> CameraModel:
@@ -180,54 +191,21 @@ def check_free(folder: Path, names: Sequence[str] = (CONFIG, MAST, TRUE_RIG)) ->
             raise InTheWay(f"{path} exists, and nothing is replaced; another folder is expected")
 
 
-def write_built(
-    rig: Rig,
-    folder: Path,
-    simulation: Mapping[str, Any],
-    seed: int,
-    limits_rad: Sequence[Sequence[float]] = USUAL_LIMITS_RAD,
-) -> Twin:
-    """Write a rig made of numbers, believed as a usual calibration leaves it. Raises as `write_twin`.
-
-    ``limits_rad`` are the soft limits of pan and tilt that are wanted, within what the head reaches.
-    """
-    known = usual_covariance(rig)
-    fit = {
-        "method": "stated",
-        "stated": STATED,
-        "parameters": list(known.names),
-        "covariance": rounded_matrix(known.covariance),
-    }
-    source = {"kind": "made by mastctl rig sim new from numbers", "seed": seed}
-    believed = replace(rig, fit=fit, provenance=source)
-    folder.mkdir(parents=True, exist_ok=True)
-    save_rig(believed, folder / MAST)
-    name_schema(folder / MAST, "mast")
-    return _write(believed, folder, simulation, seed, limits_rad)
-
-
-def write_twin(file: Path, folder: Path, simulation: Mapping[str, Any], seed: int) -> Twin:
-    """Write a mast file, to the byte, and a true rig that it could be the calibration of.
-
-    Raises BadFile, BadOptions for ``simulation``, and as `true_twin` if no true rig can be drawn.
-    """
-    believed = load_rig(file)
-    data = file.read_bytes()
-    true_twin(believed.rig, np.random.default_rng(seed))  # before anything is written
-    folder.mkdir(parents=True, exist_ok=True)
-    save_bytes(folder / MAST, data)
-    return _write(believed.rig, folder, simulation, seed)
-
-
-def _write(
+def write_rover(
     believed: Rig,
     folder: Path,
     simulation: Mapping[str, Any],
     seed: int,
     limits_rad: Sequence[Sequence[float]] = USUAL_LIMITS_RAD,
+    mast_file: Path | None = None,
 ) -> Twin:
-    """Write the true rig and the configuration, and read all of it as the daemon does."""
-    twin = true_twin(believed, np.random.default_rng(seed))
+    """Write the mast file of a rig (``mast_file``, to the byte, if it has one), a true rig that it could be
+    the calibration of, and the configuration; and read all of it as the daemon does.
+
+    ``limits_rad`` are the soft limits of pan and tilt that are wanted, within what the head reaches. Raises
+    BadFile, BadOptions for ``simulation``, and as `true_twin` if no true rig can be drawn.
+    """
+    twin = true_twin(believed, np.random.default_rng(seed))  # before anything is written
     stated = "" if twin.by == "fit.covariance" else f": {STATED}"
     provenance = {
         "kind": "the true rig of a simulated rover, which the service never reads",
@@ -235,6 +213,12 @@ def _write(
         "seed": seed,
     }
     true_rig = replace(twin.true_rig, name=f"{believed.name}_true", fit={}, provenance=provenance)
+    folder.mkdir(parents=True, exist_ok=True)
+    if mast_file is None:
+        save_rig(believed, folder / MAST)
+        name_schema(folder / MAST, "mast")
+    else:
+        save_bytes(folder / MAST, mast_file.read_bytes())
     save_rig(true_rig, folder / TRUE_RIG)
     save_bytes(folder / CONFIG, dump_mapping(_configuration(believed, simulation, limits_rad)))
     for name, kind in ((TRUE_RIG, "mast"), (CONFIG, "config")):
@@ -251,9 +235,12 @@ def _configuration(
     """The configuration that runs the rig: every camera simulated, soft limits inside the head's range."""
     wire = simulation.get("wire")
     head = PRESETS[simulation.get("head", DEFAULT_HEADS.get(str(wire), "ptu_d46_70"))]
-    pan_rad, tilt_rad = (
-        _limits(axis, usual) for axis, usual in zip((head.pan, head.tilt), limits_rad, strict=True)
-    )
+    limits = {}
+    for axis, (low, high) in zip(("pan", "tilt"), limits_rad, strict=True):
+        own: AxisSettings = getattr(head, axis)
+        margin_rad = MARGIN_RAD + own.approach_rad
+        ends = max(low, own.low_rad + margin_rad), min(high, own.high_rad - margin_rad)
+        limits[f"{axis}_rad"] = [round(end, 3) for end in ends]
     simulated = driver_of_hardware("simulated")
     return {
         "schema": CONFIG_SCHEMA,
@@ -262,21 +249,11 @@ def _configuration(
         "pan_tilt": {"driver": simulated},
         "cameras": {name: {"driver": simulated} for name in rig.cameras},
         "limits": {
-            "pan_rad": pan_rad,
-            "tilt_rad": tilt_rad,
+            **limits,
             "speed_rad_per_s": min(1.0, head.pan.speed_rad_per_s, head.tilt.speed_rad_per_s),
         },
         "simulation": {"rover": TRUE_RIG, **simulation},
     }
-
-
-def _limits(axis: AxisSettings, usual: Sequence[float]) -> list[float]:
-    """Soft limits of an axis."""
-    margin_rad = MARGIN_RAD + axis.approach_rad
-    return [
-        round(max(usual[0], axis.low_rad + margin_rad), 3),
-        round(min(usual[1], axis.high_rad - margin_rad), 3),
-    ]
 
 
 @dataclass(frozen=True, eq=False)
