@@ -176,14 +176,15 @@ def write_rig(
     alike = [name for name, one in zip(names, known, strict=True) if one and known.count(one) > 1]
     notes = [f"{' and '.join(alike)} {SAME_SERIAL}"] if alike else []
     notes += [NO_HEAD] if head is None else []
+    slow = []  # of the README alone: the rig runs
     if isinstance(head, ServosOnLine) and len(head.driven) > 1 and head.bauds[0] < USUAL_BAUD:
-        notes.append(SLOW.format(baud=head.bauds[0]))
+        slow.append(SLOW.format(baud=head.bauds[0]))
     steps = _steps(folder, head, len(names))
     note = _SERVO_NOTE if head is None or isinstance(head, ServosOnLine) else _HEAD_NOTE
     files = {
         CONFIG: f"{_CONFIG_NOTE}{note}".encode() + dump_mapping(configuration(head, plugged, numbers, port)),
         RULES: rules(head, plugged, machine, alike).encode(),
-        README: _readme(plugged, steps, notes),
+        README: _readme(plugged, steps, [*notes, *slow]),
     }
     with _all_or_nothing(folder) as draft:
         save_rig(drawing(re.sub(r"\W+", "_", folder.resolve().name) or "rig", plugged, numbers), draft / MAST)
