@@ -14,9 +14,7 @@ oppositely on either way; several speeds separate o from h, since only o grows w
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +40,8 @@ WILD_SIGMAS = 6.0
 MOST_STEPS = 40
 WEIGHTED_STEPS = 8
 SETTLED_S = 1e-6
+LARGEST_CONDITION = 1e4
+LEAST_ROWS = 0.2  # image heights between patches, from which a rolling shutter shows
 UNEXPLAINED = 0.15  # of the patches' own motion, rms: then pictures did not move with the joint
 
 
@@ -52,7 +52,10 @@ class CannotTell(MastctlError):
 
 
 class JointMotion:
-    """The joint angle over time by its readings (m,), cut into legs between turns back."""
+    """The joint angle over time by its readings (m,), cut into legs between turns back.
+
+    ``span`` is the middle of the angles and half their range, radians.
+    """
 
     def __init__(self, times_s: FloatArray, angles_rad: FloatArray) -> None:
         self.times_s, first = np.unique(times_s, return_index=True)
@@ -60,6 +63,8 @@ class JointMotion:
         if len(self.times_s) < LEAST_FRAMES:
             raise CannotTell(f"the head was read {len(self.times_s)} times, {LEAST_FRAMES} are needed")
         self._turns, self._signs = _legs(self.angles_rad)
+        low, high = float(self.angles_rad.min()), float(self.angles_rad.max())
+        self.span = (low + high) / 2, max((high - low) / 2, 1e-9)
         self._curve = _smoothed(self.times_s, self.angles_rad)
         self._speed = self._curve.derivative()
 
@@ -158,37 +163,44 @@ def fit_offset(
             "the scene is too plain, too dark or too near, or it moves"
         )
     places_px, rows = places_px[:, patches], rows[patches]
-    state = np.array([_search(motion, stamps_s, places_px), 0.0, 0.0])
-    linearised = partial(_Equations, motion, stamps_s, places_px, rows)
-    weights = np.isfinite(places_px).astype(np.float64)
+    state = np.array([*np.zeros(4 * len(rows)), _search(motion, stamps_s, places_px), 0.0, 0.0])
     for step in range(MOST_STEPS):
-        equations = linearised(state, weights)
-        change = equations.step()
-        state = state + change
-        state[0] = np.clip(state[0], -1.5 * REACH_S, 1.5 * REACH_S)
+        seen, legs, residuals_px, jacobian = _linearised(motion, stamps_s, places_px, rows, state)
         if step < WEIGHTED_STEPS:  # afterwards they stay, so that it comes to rest
-            weights = equations.robust_weights()
-        elif abs(change[0]) < SETTLED_S:
+            weights = _robust_weights(seen, residuals_px)
+        root = np.sqrt(weights[seen])
+        weighted, left = jacobian * root[:, None], residuals_px * root
+        change = np.linalg.lstsq(weighted, left, rcond=1e-12)[0]
+        state = state + change
+        state[-3] = np.clip(state[-3], -1.5 * REACH_S, 1.5 * REACH_S)
+        if step >= WEIGHTED_STEPS and abs(change[-3]) < SETTLED_S:
             break
     else:
         raise CannotTell("the fit of the time offset does not settle; a longer or wider sweep is needed")
-    if abs(state[0]) > REACH_S:
+    offset_s, rolling_s, half_play_rad = (float(value) for value in state[-3:])
+    if abs(offset_s) > REACH_S:
         raise CannotTell(f"the stamps are further than {REACH_S:g} s off the joint readings")
-    leg, _ = motion.leg(stamps_s + state[0])
-    sigmas = _sigmas(linearised, leg, state, weights)
-    seen = equations.weights > 0
-    rolls = equations.free[1]
+    rolls = bool(jacobian[:, -2].any())
+    beside = np.linalg.qr(weighted)[1][-3:, -3:]  # the columns of o, c, h without the cubics' part
+    beside = beside if rolls else beside[np.ix_((0, 2), (0, 2))]
+    if np.linalg.cond(beside / np.linalg.norm(beside, axis=0)) > LARGEST_CONDITION:
+        raise CannotTell("the head's motion cannot separate a time offset from the play of its gears")
+    # One sigma by leaving out each way of the head in turn (the jackknife): errors within one way go together
+    # (a reading's stamp, the phase of its counts, the play's side).
+    rests = [legs != leg for leg in np.unique(legs)]
+    changes = np.array([np.linalg.lstsq(weighted[rest], left[rest], rcond=1e-12)[0][-3:] for rest in rests])
+    sigmas = np.sqrt((len(rests) - 1) / len(rests) * np.sum((changes - changes.mean(axis=0)) ** 2, axis=0))
     return OffsetFit(
-        offset_s=float(state[0]),
+        offset_s=offset_s,
         sigma_s=float(sigmas[0]),
-        rolling_s=float(state[1]) if rolls else None,
+        rolling_s=rolling_s if rolls else None,
         rolling_sigma_s=float(sigmas[1]) if rolls else None,
-        play_rad=float(2 * state[2]),
+        play_rad=2 * half_play_rad,
         play_sigma_rad=float(2 * sigmas[2]),
-        frames=len(equations.frames),
-        patches=int(np.isfinite(equations.residuals_px).any(axis=0).sum()),
-        legs=len(equations.legs),
-        rms_px=float(np.sqrt(np.average(equations.residuals_px[seen] ** 2, weights=equations.weights[seen]))),
+        frames=int(seen.any(axis=1).sum()),
+        patches=int(seen.any(axis=0).sum()),
+        legs=len(rests),
+        rms_px=float(np.sqrt(np.average(residuals_px**2, weights=weights[seen]))),
     )
 
 
@@ -233,96 +245,49 @@ def _unexplained(angles_rad: FloatArray, places_px: FloatArray) -> float:
     return float(np.median(sizes) / max((high - low) / 2, 1e-9))
 
 
-class _Equations:
-    """The problem linearised at a state (o, c, h), each patch's cubic taken out of it."""
+def _linearised(
+    motion: JointMotion, stamps_s: FloatArray, places_px: FloatArray, rows: FloatArray, state: FloatArray
+) -> tuple[NDArray[np.bool_], NDArray[np.int64], FloatArray, FloatArray]:
+    """The problem at a state: each patch's cubic (4 each), then o, c and h.
 
-    def __init__(
-        self,
-        motion: JointMotion,
-        stamps_s: FloatArray,
-        places_px: FloatArray,
-        rows: FloatArray,
-        state: FloatArray,
-        weights: FloatArray,
-    ) -> None:
-        self.free = np.array([True, float(np.ptp(rows)) > 0.2, True])  # of (o, c, h)
-        self.residuals_px = np.full(places_px.shape, np.nan)
-        self.weights = np.zeros(places_px.shape)
-        self.normal = np.zeros((3, 3))
-        self.right = np.zeros(3)
-        self.legs: set[int] = set()
-        self.frames: set[int] = set()
-        for patch, row in enumerate(rows):
-            times_s = stamps_s + state[0] + state[1] * row
-            leg, sign = motion.leg(times_s)
-            seen = np.isfinite(places_px[:, patch]) & (leg >= 0) & (weights[:, patch] > 0)
-            if seen.sum() < LEAST_FRAMES // 2:
-                continue
-            root = np.sqrt(weights[seen, patch])
-            angles_rad = motion.at(times_s[seen]) - state[2] * sign[seen]
-            span = max(float(np.ptp(angles_rad)), 1e-9)
-            scaled = (angles_rad - angles_rad.mean()) * (2 / span)
-            base = np.vander(scaled, 4)
-            base_q, triangle = np.linalg.qr(base * root[:, None])
-            cubic = np.linalg.solve(triangle, base_q.T @ (places_px[seen, patch] * root))
-            slope = np.vander(scaled, 3) @ (cubic[:3] * [3, 2, 1]) * (2 / span)
-            speed = motion.slope(times_s[seen])
-            ways = slope[:, None] * np.stack([speed, speed * row, -sign[seen]], axis=1) * root[:, None]
-            ways -= base_q @ (base_q.T @ ways)
-            residual = places_px[seen, patch] - base @ cubic
-            self.residuals_px[seen, patch] = residual
-            self.weights[seen, patch] = weights[seen, patch]
-            self.normal += ways.T @ ways
-            self.right += ways.T @ (residual * root)
-            self.frames |= set(np.flatnonzero(seen).tolist())
-            self.legs |= set(leg[seen].tolist())
-        if len(self.frames) < LEAST_FRAMES or len(self.legs) < LEAST_LEGS:
-            raise CannotTell(
-                f"{len(self.frames)} frames on {len(self.legs)} ways of the head can be used, "
-                f"{LEAST_FRAMES} on {LEAST_LEGS} are needed"
-            )
-
-    def _inverse(self) -> FloatArray:
-        """The inverse of the normal matrix of what is free, zero elsewhere."""
-        found = np.zeros((3, 3))
-        part = self.normal[np.ix_(self.free, self.free)]
-        scale = np.sqrt(np.diag(part))
-        if not (scale > 0).all() or np.linalg.cond(part / np.outer(scale, scale)) > 1e8:
-            raise CannotTell("the head's motion cannot separate a time offset from the play of its gears")
-        found[np.ix_(self.free, self.free)] = np.linalg.inv(part)
-        return found
-
-    def step(self) -> FloatArray:
-        """The change of the state that is best in the linearised problem."""
-        return self._inverse() @ self.right
-
-    def robust_weights(self) -> FloatArray:
-        """Weights by Huber, each patch by its own scale."""
-        sizes = np.abs(self.residuals_px)
-        with np.errstate(all="ignore"):
-            scale = 1.4826 * np.nanmedian(np.where(np.isfinite(sizes), sizes, np.nan), axis=0)
-            weights = np.minimum(1.0, ROBUST_SIGMAS * np.maximum(scale, 1e-6) / np.maximum(sizes, 1e-12))
-            typical = np.nanmedian(scale)
-            weights[sizes > WILD_SIGMAS * np.maximum(scale, 1e-6)] = 0.0
-            weights *= (typical / np.maximum(scale, 0.1 * typical)) ** 2
-        # What a change of the offset left out for now is not lost for good.
-        return np.where(np.isfinite(sizes), np.maximum(weights, 1e-6), 1e-3)
-
-
-def _sigmas(
-    linearised: Callable[[FloatArray, FloatArray], _Equations],
-    leg: NDArray[np.int64],
-    state: FloatArray,
-    weights: FloatArray,
-) -> FloatArray:
-    """One sigma of the state, (3,), by leaving out each way of the head in turn (the jackknife).
-
-    Errors within one way go together: a reading's stamp, the phase of its counts, the play's side.
+    Returns which places (n, p) can be used; the leg, the residual (px) and the derivatives of each of these.
+    Raises CannotTell if they are too few.
     """
-    changes = []
-    for number in np.unique(leg[leg >= 0]):
-        rest = np.where((leg == number)[:, None], 0.0, weights)
-        changes.append(linearised(state, rest).step())
-    spread = np.array(changes) - np.mean(changes, axis=0)
-    sigmas: FloatArray = np.sqrt((len(changes) - 1) / len(changes) * np.sum(spread**2, axis=0))
-    return sigmas
+    offset_s, rolling_s, half_play_rad = state[-3:]
+    times_s = stamps_s[:, None] + offset_s + rolling_s * rows
+    leg, sign = motion.leg(times_s)
+    seen = np.isfinite(places_px) & (leg >= 0)
+    seen &= seen.sum(axis=0) >= LEAST_FRAMES // 2
+    legs, signs, times_s = leg[seen], sign[seen], times_s[seen]
+    frames, ways = int(seen.any(axis=1).sum()), len(np.unique(legs))
+    if frames < LEAST_FRAMES or ways < LEAST_LEGS:
+        raise CannotTell(
+            f"{frames} frames on {ways} ways of the head can be used, "
+            f"{LEAST_FRAMES} on {LEAST_LEGS} are needed"
+        )
+    patches = np.nonzero(seen)[1]
+    middle_rad, half_rad = motion.span
+    scaled = (motion.at(times_s) - half_play_rad * signs - middle_rad) / half_rad
+    powers, cubics = np.vander(scaled, 4), state[:-3].reshape(-1, 4)[patches]
+    slope = np.sum(np.vander(scaled, 3) * cubics[:, :3] * [3, 2, 1], axis=1) / half_rad
+    speed = motion.slope(times_s)
+    rolls = np.ptp(rows) > LEAST_ROWS
+    jacobian = np.zeros((len(patches), len(state)))
+    jacobian[np.arange(len(patches))[:, None], 4 * patches[:, None] + np.arange(4)] = powers
+    jacobian[:, -3:] = slope[:, None] * np.stack([speed, rolls * speed * rows[patches], -signs], axis=1)
+    return seen, legs, places_px[seen] - np.sum(powers * cubics, axis=1), jacobian
+
+
+def _robust_weights(seen: NDArray[np.bool_], residuals_px: FloatArray) -> FloatArray:
+    """Weights (n, p) by Cauchy, each patch by its own scale; none far outside.
+
+    What a change of the offset left out for now is not lost for good: it has the full weight of its patch.
+    """
+    sizes_px = np.zeros(seen.shape)
+    sizes_px[seen] = np.abs(residuals_px)
+    scale_px = np.array(
+        [np.median(sizes_px[mine, n]) if mine.any() else 1.0 for n, mine in enumerate(seen.T)]
+    )
+    scale_px = np.maximum(1.4826 * scale_px, 1e-6)
+    found: FloatArray = 1.0 / scale_px**2 / (1.0 + (sizes_px / (ROBUST_SIGMAS * scale_px)) ** 2)
+    return found * (sizes_px <= WILD_SIGMAS * scale_px)

@@ -8,24 +8,22 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
+from calib.matching.warp import Grey, grey, summit
 from drivers.clock import Clock
-from drivers.errors import DriverError, NoReply
+from drivers.errors import NoReply
 from drivers.interfaces import Camera, Frame, Image, Reading
 from mastctl.devices.devices import Devices
 from mastctl.devices.judge import Limits
-from mastctl.devices.thread import DeviceThread
-from mastctl.errors import MastctlError
 from mastctl.setup.sync_fit import REACH_S, CannotTell, JointMotion, OffsetFit, fit_offset
 
 SIGNIFICANT_SIGMAS = 3.0
@@ -38,8 +36,7 @@ READ_EVERY_S = 0.005
 REST_S = REACH_S + 0.4  # before the picture at rest: also one that is stamped too new shows the rest
 ARRIVE_S = 10.0
 FRAME_TIMEOUT_S = 5.0
-GRACE_S = 1.0  # beyond it a driver that should have answered hangs
-END_S = FRAME_TIMEOUT_S + GRACE_S  # a driver that is still at work at the end is left to itself
+END_S = FRAME_TIMEOUT_S + 1.0  # beyond it a driver that should have answered hangs
 LOST_FRAMES = 3
 LATEST_S = 2.0  # from a frame's exposure to its coming, beside what its stamps may be off
 
@@ -136,15 +133,11 @@ class Sweep:
             self._limits.check(*goal)
             self._devices.judge.check_move(goal, lambda: start)
         self._limits.speed(plan.speed_rad_per_s)
-        for name in self._cameras:
-            self._choose(name, start, plan)
-        threads = [
-            self._clock.thread(partial(self._follow, name), f"sweep {name}")
-            for name, seen in self.seen.items()
-            if not seen.failure
-        ]
-        for thread in threads:
-            thread.start()
+        self._await(self._threads(partial(self._choose, start, plan)))
+        for seen in self.seen.values():
+            if seen.patches is None:
+                seen.failure = seen.failure or f"it gave no image within {END_S:g} s"
+        threads = self._threads(self._follow)
         try:
             if self._to_and_fro(start, plan):
                 self._go(start.pan_rad, start.tilt_rad, plan.speed_rad_per_s)
@@ -153,26 +146,7 @@ class Sweep:
             raise
         finally:
             self._over.set()
-            end_s = self._clock.now_s() + END_S
-            while any(thread.is_alive() for thread in threads) and self._clock.now_s() < end_s:
-                self._clock.sleep(READ_EVERY_S)
-
-    def fit(self, camera: str) -> OffsetFit:
-        """Return a camera's offset to the joint readings. Raises CannotTell."""
-        seen = self.seen[camera]
-        if seen.failure and not seen.stamps_s:
-            raise CannotTell(seen.failure)
-        if seen.patches is None or not seen.stamps_s:
-            raise CannotTell("it gave no image while the head turned")
-        seen.check_clock()
-        motion = JointMotion(
-            np.array([reading.time_s for reading in self._readings]),
-            np.array([reading.pan_rad for reading in self._readings]),
-        )
-        try:
-            return fit_offset(motion, np.array(seen.stamps_s), np.array(seen.places_px), seen.patches.rows)
-        except CannotTell as error:
-            raise CannotTell(f"{error}; {seen.failure}" if seen.failure else str(error)) from None
+            self._await(threads)
 
     def found(self, camera: str, in_use_s: float) -> dict[str, Any]:
         """Return a camera's result as JSON; ``offset_s`` is null, and ``failure`` says why, if there is none.
@@ -190,9 +164,10 @@ class Sweep:
             "failure": None,
         }
         try:
-            fit = self.fit(camera)
+            fit = self._fit(seen)
         except CannotTell as error:
-            return found | {"failure": str(error)}
+            failures = [str(error), seen.failure] if seen.stamps_s and seen.failure else [str(error)]
+            return found | {"failure": "; ".join(failures)}
         beyond_s = SIGNIFICANT_SIGMAS * fit.sigma_s + seen.uncertainty_s
         if abs(fit.offset_s) > max(beyond_s, LEAST_S):
             side = "later" if fit.offset_s > 0 else "earlier"
@@ -202,6 +177,31 @@ class Sweep:
                 f"{1e3 * seen.uncertainty_s:.1f} ms that the driver states)"
             )
         return found | vars(fit) | {"offset_s": in_use_s + fit.offset_s, "left_s": fit.offset_s}
+
+    def _fit(self, seen: Sightings) -> OffsetFit:
+        """A camera's offset to the joint readings. Raises CannotTell."""
+        if seen.patches is None or not seen.stamps_s:
+            raise CannotTell(seen.failure or "it gave no image while the head turned")
+        seen.check_clock()
+        motion = JointMotion(
+            np.array([reading.time_s for reading in self._readings]),
+            np.array([reading.pan_rad for reading in self._readings]),
+        )
+        return fit_offset(motion, np.array(seen.stamps_s), np.array(seen.places_px), seen.patches.rows)
+
+    def _threads(self, work: Callable[[str], None]) -> list[threading.Thread]:
+        """Begin some work for each camera that has not failed, in a thread of its own."""
+        names = [name for name, seen in self.seen.items() if not seen.failure]
+        threads = [self._clock.thread(partial(work, name), f"sweep {name}") for name in names]
+        for thread in threads:
+            thread.start()
+        return threads
+
+    def _await(self, threads: Sequence[threading.Thread]) -> None:
+        """Wait for threads; a driver that is still at work at the end is left to itself."""
+        end_s = self._clock.now_s() + END_S
+        while any(thread.is_alive() for thread in threads) and self._clock.now_s() < end_s:
+            self._clock.sleep(READ_EVERY_S)
 
     def _note(self) -> Reading:
         """Record the newest reading."""
@@ -245,25 +245,19 @@ class Sweep:
                 raise NoReply(f"the head does not come to pan {pan_rad:.3f} rad", device="pan_tilt")
             self._clock.sleep(READ_EVERY_S)
 
-    def _choose(self, name: str, start: Reading, plan: SweepPlan) -> None:
+    def _choose(self, start: Reading, plan: SweepPlan, name: str) -> None:
         """Take a camera's image at rest and choose what to follow in it; its failure is in `seen`."""
-        camera, thread = self._cameras[name], DeviceThread(name, clock=self._clock)
+        joints_rad = self._rig.joints.true_rad((start.pan_rad, start.tilt_rad))
         try:
-            after_s = self._clock.now_s()
-            frame = thread.call(
-                "next_frame", lambda: camera.next_frame(after_s, FRAME_TIMEOUT_S), FRAME_TIMEOUT_S + GRACE_S
-            )
-            joints_rad = self._rig.joints.true_rad((start.pan_rad, start.tilt_rad))
+            frame = self._cameras[name].next_frame(self._clock.now_s(), FRAME_TIMEOUT_S)
             self.seen[name].patches = choose_patches(
                 frame.image, self._rig, name, joints_rad, plan.amplitude_rad
             )
-        except (DriverError, MastctlError) as error:
-            self.seen[name].failure = str(error)
-        finally:
-            thread.end()
+        except Exception as error:  # a foreign driver may raise anything
+            self.seen[name].failure = str(error) or type(error).__name__
 
     def _follow(self, name: str) -> None:
-        """In a thread of its own: find a camera's patches in what comes."""
+        """Find a camera's patches in what comes."""
         seen, camera = self.seen[name], self._cameras[name]
         lost, after_s = 0, self._clock.now_s()
         while not self._over.is_set():
@@ -274,8 +268,7 @@ class Sweep:
             except Exception as error:  # a foreign driver may raise anything
                 lost += 1
                 if lost == LOST_FRAMES and not self._over.is_set():
-                    known = isinstance(error, DriverError)
-                    seen.failure = str(error) if known else f"{type(error).__name__}: {error}"
+                    seen.failure = str(error) or type(error).__name__
                     return
                 self._clock.sleep(0.05)
 
@@ -311,7 +304,7 @@ class Patches:
     they move, and ``rows`` (p,) their rows in image heights from the middle.
     """
 
-    templates: tuple[Image, ...]
+    templates: tuple[Grey, ...]
     centres_px: FloatArray
     windows_px: FloatArray
     ways: FloatArray
@@ -319,10 +312,10 @@ class Patches:
 
     def places_px(self, image: Image) -> FloatArray:
         """Return the (p,) places along their ways in a picture; not-a-number where a patch is not found."""
-        picture = grey_bytes(image)
+        picture = grey(image)
         return np.array([self._place_px(picture, number) for number in range(len(self.templates))])
 
-    def _place_px(self, picture: Image, number: int) -> float:
+    def _place_px(self, picture: Grey, number: int) -> float:
         x0, y0, x1, y1 = self.windows_px[number].astype(int)
         part = picture[y0 - HALF_PX : y1 + HALF_PX + 1, x0 - HALF_PX : x1 + HALF_PX + 1]
         score = cv2.matchTemplate(part, self.templates[number], cv2.TM_CCOEFF_NORMED)
@@ -330,17 +323,12 @@ class Patches:
         height, width = score.shape
         if best < LEAST_CORRELATION or not (0 < x < width - 1 and 0 < y < height - 1):
             return np.nan
-        offset = np.array([_peak(*score[y, x - 1 : x + 2]), _peak(*score[y - 1 : y + 2, x])])
+        offset = np.array([summit(*score[y, x - 1 : x + 2]), summit(*score[y - 1 : y + 2, x])])
         place = np.array([x0 + x, y0 + y]) + offset - self.centres_px[number]
         score[max(0, y - APART_PX) : y + APART_PX + 1, max(0, x - APART_PX) : x + APART_PX + 1] = -1.0
         if best - float(score.max()) < LEAST_LEAD:
             return np.nan
         return float(place @ self.ways[number])
-
-
-def grey_bytes(image: Image) -> Image:
-    """Return a picture's grey levels, bytes, (h, w)."""
-    return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
 
 
 def choose_patches(
@@ -351,9 +339,10 @@ def choose_patches(
     ``image`` is of a head at rest at ``joints_rad`` (pan, tilt). ``rig`` predicts roughly where things go;
     the measurement does not use it. Raises CannotTell if nothing differs from its surroundings.
     """
-    picture = grey_bytes(image)
+    picture = grey(image)
     height, width = picture.shape
-    corners = cv2.goodFeaturesToTrack(picture, 400, 0.02, 2 * HALF_PX, blockSize=9, useHarrisDetector=False)
+    apart_px = max(2 * HALF_PX, height / 8)  # a rolling shutter shows between patches of many rows
+    corners = cv2.goodFeaturesToTrack(picture, 400, 0.02, apart_px, blockSize=9)
     if corners is None:
         raise CannotTell("the scene is too plain: nothing in the picture can be followed")
     centres = np.rint(corners.reshape(-1, 2)).astype(np.float64)
@@ -363,7 +352,7 @@ def choose_patches(
     high = np.ceil(np.maximum(centres + moves.max(axis=0), centres) + PAD_PX)
     inside = np.isfinite(moves).all(axis=(0, 2))
     inside &= (low >= HALF_PX).all(axis=1) & (high <= np.array([width, height]) - 1 - HALF_PX).all(axis=1)
-    chosen = _spread(centres, np.flatnonzero(inside), height)
+    chosen = np.flatnonzero(inside)[:MOST_PATCHES]  # the clearest come first
     if not len(chosen):
         raise CannotTell(
             "nothing that can be followed stays in the picture; a smaller --amplitude, or a view with more "
@@ -371,7 +360,10 @@ def choose_patches(
         )
     ways = (ends[1] - ends[0])[chosen]
     return Patches(
-        templates=tuple(_square(picture, centre) for centre in centres[chosen]),
+        templates=tuple(
+            picture[y - HALF_PX : y + HALF_PX + 1, x - HALF_PX : x + HALF_PX + 1].copy()
+            for x, y in centres[chosen].astype(int)
+        ),
         centres_px=centres[chosen],
         windows_px=np.hstack([low, high])[chosen],
         ways=ways / np.linalg.norm(ways, axis=1, keepdims=True),
@@ -390,25 +382,3 @@ def moved_px(
     back = rig.mast.rover_from_head(pan_rad + pan_by_rad, tilt_rad).inverse.points(far)
     found: FloatArray = model.project(back)[0]
     return found
-
-
-def _spread(centres_px: FloatArray, allowed: NDArray[np.intp], height: int) -> NDArray[np.intp]:
-    """Choose the best corners (they come best first) of each of four strips of rows by turns."""
-    strips = [[i for i in allowed if int(4 * centres_px[i, 1] / height) == strip] for strip in range(4)]
-    chosen: list[int] = []
-    while len(chosen) < MOST_PATCHES and any(strips):
-        for strip in strips:
-            if strip and len(chosen) < MOST_PATCHES:
-                chosen.append(strip.pop(0))
-    return np.array(chosen, dtype=np.intp)
-
-
-def _square(picture: Image, centre_px: FloatArray) -> Image:
-    x, y = centre_px.astype(int)
-    return picture[y - HALF_PX : y + HALF_PX + 1, x - HALF_PX : x + HALF_PX + 1].copy()
-
-
-def _peak(before: float, at: float, after: float) -> float:
-    """Where a parabola through three neighbours has its top, from the middle one."""
-    bend = before - 2 * at + after
-    return 0.0 if bend >= 0 else 0.5 * (before - after) / bend
