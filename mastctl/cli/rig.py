@@ -58,8 +58,7 @@ def _new(args: argparse.Namespace) -> Answer:
 
     check_folder(args.folder, "FOLDER")
     check_free(args.folder, RIG_FILES)
-    machine = ExaminedMachine()
-    found = find_plugged(args.port, machine, output.tell)
+    found = find_plugged(args.port, ExaminedMachine(), output.tell)
     for line in (*(f"found {one}" for one in found.summaries), *found.unused):
         output.tell(line)
     if len(found.heads) > 1:
@@ -78,7 +77,7 @@ def _new(args: argparse.Namespace) -> Answer:
         output.tell(TWIN)
         made = write_simulated(args.folder, found, numbers)
     else:
-        made = write_rig(args.folder, found, head, numbers, machine)
+        made = write_rig(args.folder, found, head, numbers)
     for note in made.notes:
         output.tell(note)
     document = {

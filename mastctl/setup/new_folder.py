@@ -46,14 +46,10 @@ from mastctl.setup.simulated_rig import (
 RULES, README = "60-mastctl.rules", "README.md"
 RIG_FILES = (CONFIG, MAST, TRUE_RIG, RULES, README, SCHEMAS)
 LINE = "/dev/mast"
-"""What the rules call the head's line."""
+"""What stands for a head's line that is not known yet."""
 NO_HEAD = (
     f"no head answered: {LINE} in {CONFIG} stands for its line. Plug the head in and run mastctl rig new "
     "with another folder, or write the line's name there"
-)
-SAME_SERIAL = (
-    "have the same serial number: the udev rules and the configuration know them by their USB sockets, so "
-    "leave each in its socket"
 )
 SLOW = (
     "the servos speak {baud} baud, which delays every reading: `mastctl rig servo set-id` with "
@@ -62,8 +58,6 @@ SLOW = (
 TWIN_SIZE_PX, TWIN_SEED = (640, 480), 1
 MARGIN_RAD = 0.1
 """Between the limits that a head's driver holds and the soft ones."""
-_NUMBERED = re.compile(r"/dev/tty(USB|ACM)\d+")
-_USB = re.compile(rf"{_NUMBERED.pattern}|/dev/serial/by-.*")
 MOST_CAMERAS = 2
 NO_POWER = "; is its power on?"
 BY_HAND = "write it into configuration and mast file by hand (configs/rigs/rover.yaml has six)"
@@ -163,27 +157,20 @@ class NewRigFolder:
     notes: tuple[str, ...] = ()
 
 
-def write_rig(
-    folder: Path, plugged: Plugged, head: ProbedHead | None, numbers: RigNumbers, machine: ExaminedMachine
-) -> NewRigFolder:
+def write_rig(folder: Path, plugged: Plugged, head: ProbedHead | None, numbers: RigNumbers) -> NewRigFolder:
     """Write the files of a rig with a head, cameras or both, and read them as the daemon does.
 
     Raises InTheWay, and BadFile or BadOptions if the numbers make no rig.
     """
-    port = LINE if head is None or _NUMBERED.fullmatch(head.port) else head.port
-    names = camera_names(plugged)
-    known = [_usb_of(_device(camera, machine)) for camera in plugged.cameras]
-    alike = [name for name, one in zip(names, known, strict=True) if one and known.count(one) > 1]
-    notes = [f"{' and '.join(alike)} {SAME_SERIAL}"] if alike else []
-    notes += [NO_HEAD] if head is None else []
+    notes = [NO_HEAD] if head is None else []
     slow = []  # of the README alone: the rig runs
     if isinstance(head, ServosOnLine) and len(head.driven) > 1 and head.bauds[0] < USUAL_BAUD:
         slow.append(SLOW.format(baud=head.bauds[0]))
-    steps = _steps(folder, head, len(names))
+    steps = _steps(folder, head, len(plugged.cameras))
     note = _SERVO_NOTE if head is None or isinstance(head, ServosOnLine) else _HEAD_NOTE
     files = {
-        CONFIG: f"{_CONFIG_NOTE}{note}".encode() + dump_mapping(configuration(head, plugged, numbers, port)),
-        RULES: rules(head, plugged, machine, alike).encode(),
+        CONFIG: f"{_CONFIG_NOTE}{note}".encode() + dump_mapping(configuration(head, plugged, numbers)),
+        RULES: (config_folder() / "udev" / RULES).read_bytes(),
         README: _readme(plugged, steps, [*notes, *slow]),
     }
     with _all_or_nothing(folder) as draft:
@@ -250,23 +237,18 @@ def camera_names(plugged: Plugged) -> list[str]:
     return ["cam_left", "cam_right"] if count > 1 else ["cam"][:count]
 
 
-def configuration(
-    head: ProbedHead | None, plugged: Plugged, numbers: RigNumbers, port: str
-) -> dict[str, Any]:
-    """Return the configuration; without a head, that of two usual servos which are still to be plugged in.
-
-    ``port`` is what the head's line is called.
-    """
+def configuration(head: ProbedHead | None, plugged: Plugged, numbers: RigNumbers) -> dict[str, Any]:
+    """Return the configuration; without a head, that of two usual servos which are still to be plugged in."""
     if head is None:
         benches = (driver.bench for driver in drivers_of("head").values())
-        head = ServosOnLine(next(bench for bench in benches if isinstance(bench, ServoBench)), "")
+        head = ServosOnLine(next(bench for bench in benches if isinstance(bench, ServoBench)), LINE)
     ends = {"pan": _radians(numbers.pan_deg), "tilt": _radians(numbers.tilt_deg)}
     options, reached = head.configured(ends, {"pan": numbers.pan_id, "tilt": numbers.tilt_id})
     return {
         "schema": CONFIG_SCHEMA,
         "mast_file": MAST,
         "listen": {"host": "127.0.0.1", "port": 8420},
-        "pan_tilt": {"driver": head.driver, "options": {"port": port, **options}},
+        "pan_tilt": {"driver": head.driver, "options": {"port": head.port, **options}},
         "cameras": {
             name: {"driver": camera.driver, "options": dict(camera.options)}
             for name, camera in zip(camera_names(plugged), plugged.cameras, strict=True)
@@ -326,62 +308,19 @@ _MAST_NOTE = """\
 """
 
 
-def _usb_of(device: Path, by_socket: bool = False) -> list[str]:
-    """The udev matches that single out a USB device: by its serial number, else its socket.
-
-    ``device`` is its folder in sysfs; nothing is returned for what is not on USB. ``by_socket``: where others
-    have the same serial number.
-    """
-    place = device.resolve()
-    folder = next((one for one in (place, *place.parents) if (one / "idVendor").is_file()), None)
-    if folder is None:
-        return []
-    names = ("idVendor", "idProduct") if by_socket else ("idVendor", "idProduct", "serial")
-    found = {name: (folder / name).read_text().strip() for name in names if (folder / name).is_file()}
-    matches = [f'ATTRS{{{name}}}=="{value}"' for name, value in found.items()]
-    return matches if "serial" in found else [*matches, f'KERNELS=="{folder.name}"']
-
-
-def _device(camera: ProbedCamera, machine: ExaminedMachine) -> Path:
-    """A camera's folder in sysfs; that of none for a camera without a node."""
-    node = "none" if camera.node is None else camera.node.name
-    return machine.at("/sys/class/video4linux") / node / "device"
-
-
-def rules(
-    head: ProbedHead | None, plugged: Plugged, machine: ExaminedMachine, alike: Sequence[str] = ()
-) -> str:
-    """Return the packaged udev rules, and a stable name for each device of this rig.
-
-    ``alike`` are cameras of one serial number.
-    """
-    text = (config_folder() / "udev" / RULES).read_text(encoding="utf-8")
-    lines = []
-    if head is not None and "://" not in head.port:
-        device = machine.at("/sys/class/tty") / machine.at(head.port).resolve().name / "device"
-        lines += _rule('SUBSYSTEM=="tty", SUBSYSTEMS=="usb"', _usb_of(device), LINE[5:])
-    for name, camera in zip(camera_names(plugged), plugged.cameras, strict=True):
-        matches = _usb_of(_device(camera, machine), by_socket=name in alike)
-        about = 'SUBSYSTEM=="video4linux", ATTR{index}=="0"'
-        lines += _rule(about, matches, f"v4l/by-id/mast-{name.replace('_', '-')}")
-    return "\n".join([text, "# This rig:", *lines, ""]) if lines else text
-
-
-def _rule(about: str, matches: Sequence[str], name: str) -> list[str]:
-    """One line of a rule, if there is something to know the device by."""
-    return [f'{", ".join([about, *matches])}, SYMLINK+="{name}"'] if matches else []
-
-
 def _steps(folder: Path, head: ProbedHead | None, cameras: int) -> tuple[str, ...]:
     """The next three commands."""
     config = f"--config {quote(str(folder / CONFIG))}"
-    rules = f"sudo cp {quote(str(folder / RULES))} /etc/udev/rules.d/ && sudo udevadm control --reload"
+    rules = (
+        f"sudo cp {quote(str(folder / RULES))} /etc/udev/rules.d/ && sudo udevadm control --reload "
+        "&& sudo udevadm trigger"
+    )
     doctor, run = f"mastctl rig doctor {config}", f"mastctl run {config}"
     if head is None:
-        return f"{rules} && sudo udevadm trigger", "mastctl rig servo scan PORT", doctor
+        return rules, "mastctl rig servo scan PORT", doctor
+    by_rule = head.port.startswith(("/dev/ttyUSB", "/dev/ttyACM", "/dev/serial/by-")) or cameras
     point = f"mastctl point {config} --angles 0.2 0.0"
-    by_rule = _USB.fullmatch(head.port) or cameras
-    steps = (f"{rules} && sudo udevadm trigger", doctor, run) if by_rule else (doctor, run, point)
+    steps = (rules, doctor, run) if by_rule else (doctor, run, point)
     numbering = missing_servo(head)[1]
     return (numbering, *steps[:2]) if numbering else steps
 

@@ -39,7 +39,6 @@ from mastctl.config import load_config
 from mastctl.packaged import schema_files
 from mastctl.setup import doctor
 from mastctl.setup import new_folder as folder_module
-from mastctl.setup.doctor import ExaminedMachine
 from mastctl.setup.new_folder import README, RULES, Plugged, head_probes, write_rig
 from mastctl.setup.simulated_rig import CONFIG, MAST, RigNumbers
 
@@ -221,47 +220,12 @@ CAMERAS = tuple(
 SERVOS = tuple(FoundServo(1_000_000, number, 1020, "XM430-W350", 45, ()) for number in (1, 2))
 
 
-def machine_with(tmp_path: Path, serial: str | None) -> ExaminedMachine:
-    """A machine with an adapter at ttyUSB0 and cameras at video0 and video2, in a folder."""
-    cameras = (("1-3", "video4linux", "video0"), ("1-4", "video4linux", "video2"))
-    for place, kind, node in (("1-2", "tty", "ttyUSB0"), *cameras):
-        device = tmp_path / "sys/devices" / place / f"{place}:1.0"
-        device.mkdir(parents=True)
-        (device.parent / "idVendor").write_text("0403\n")
-        (device.parent / "idProduct").write_text("6014\n")
-        if serial is not None:
-            (device.parent / "serial").write_text(f"{serial}\n")
-        of_class = tmp_path / "sys/class" / kind / node
-        of_class.mkdir(parents=True)
-        (of_class / "device").symlink_to(device)
-    return ExaminedMachine(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("serial", "told"), [("FT12345", 'ATTRS{serial}=="FT12345"'), (None, 'KERNELS=="1-2"')]
-)
-def test_an_adapter_without_a_stable_name_gets_one_by_a_rule(
-    tmp_path: Path, serial: str | None, told: str
-) -> None:
-    machine = machine_with(tmp_path / "machine", serial)
-    folder = tmp_path / "rig"
-    head = ServosOnLine(BENCH, "/dev/ttyUSB0", SERVOS)
-    made = write_rig(folder, Plugged((head,), CAMERAS), head, RigNumbers(1.0, 0.1, 60.0), machine)
-    lines = (folder / RULES).read_text().splitlines()
-    line = next(one for one in lines if one.endswith('SYMLINK+="mast"') and not one.startswith("#"))
-    known = 'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6014"'
-    assert line.startswith(f'SUBSYSTEM=="tty", SUBSYSTEMS=="usb", {known}, ')
-    assert told in line
-    assert 'SYMLINK+="v4l/by-id/mast-cam-left"' in (folder / RULES).read_text()
-    assert load_config(folder / CONFIG).hardware.pan_tilt.options["port"] == "/dev/mast"
-    assert made.next[0].startswith("sudo cp ") and str(folder / RULES) in made.next[0]
-    assert all(step in (folder / README).read_text() for step in made.next)
-
-
 def test_a_pair_of_cameras_is_drawn_with_options_of_its_driver(tmp_path: Path) -> None:
     head = ServosOnLine(BENCH, "/dev/serial/by-id/usb-FTDI", SERVOS)
     answers = RigNumbers(1.0, 0.16, 90.0)
-    write_rig(tmp_path / "rig", Plugged((head,), CAMERAS), head, answers, ExaminedMachine(tmp_path))
+    made = write_rig(tmp_path / "rig", Plugged((head,), CAMERAS), head, answers)
+    assert made.next[0].startswith("sudo cp ") and str(tmp_path / "rig" / RULES) in made.next[0]
+    assert all(step in (tmp_path / "rig" / README).read_text() for step in made.next)
     good_by_schema(tmp_path / "rig")
     config = load_config(tmp_path / "rig" / CONFIG)
     rig = load_rig(config.mast_file).rig
