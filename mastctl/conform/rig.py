@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import yaml
 
-from mastctl.client import Client, ClientError, Snapshot
+from mastctl.client import Client, ClientError
 from mastctl.conform.device_checks import NotTried, PromiseBroken, expect
 from mastctl.errors import NotNow
 
@@ -140,10 +140,6 @@ class RigTrial:
         if not self.began["cameras"]:
             raise NotTried("there is no camera")
         return tuple(self.began["cameras"])
-
-    def picture(self, camera: str) -> Snapshot:
-        """Take a picture that is exposed from now on."""
-        return self.client.snapshot(camera)
 
     def ended(self, name: str, each: Callable[[Mapping[str, Any]], object] = lambda status: None) -> Any:
         """Wait until an operation has ended and return its record; ``each`` is given the status meanwhile."""
