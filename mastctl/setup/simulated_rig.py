@@ -281,7 +281,8 @@ def true_twin(believed: Rig, rng: np.random.Generator) -> Twin:
     if known is None:
         known = usual_covariance(believed)
     values, vectors = np.linalg.eigh(known.covariance)
-    step = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(len(values)))
+    # By the symmetric root, which is one: equal eigenvalues have no vectors of their own to draw by.
+    step = vectors @ (np.sqrt(np.maximum(values, 0.0)) * (vectors.T @ rng.standard_normal(len(values))))
     try:
         true_rig = moved_rig(believed, known.names, step)
         drawn = (true_rig.joints.pan, true_rig.joints.tilt)
