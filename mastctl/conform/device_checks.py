@@ -1,17 +1,14 @@
-"""What a camera promises, tested on its frames and settings, and calls to a device that come back in time.
+"""What a camera promises, tested on its frames, and calls to a device that come back in time.
 
-``mastctl camera check``, ``mastctl conform`` and the acceptance of drivers (`mastctl.testing.drivers`) share
-them.
+``mastctl camera check`` and the acceptance of drivers (`mastctl.testing.drivers`) share them.
 """
 
 from __future__ import annotations
 
-import math
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
@@ -24,7 +21,7 @@ from calib.files.mast_file import sensor_mode_keys
 from calib.geometry.mode import SensorMode
 from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, NoFreshFrame
-from drivers.interfaces import Camera, CameraSetting, Frame, Image
+from drivers.interfaces import Camera, Frame, Image
 from mastctl.devices import frames as frame_checks
 from mastctl.devices.judge import OutsideLimits
 from mastctl.devices.keep_out import KeptOut
@@ -38,9 +35,6 @@ PACE_TOLERANCE = 0.2
 MOST_PROBLEMS = 20
 STATED = ("size_px", "sensor_mode", "period_s")
 DARK, SATURATED = 5, 250
-SETTING_FRAMES = 20  # so many may be of unknown settings after a change
-SETTING_PART = 0.05  # of its value a setting is changed by, one step at least
-ROUNDING = 1e-6
 
 
 class PromiseBroken(AssertionError):
@@ -275,65 +269,3 @@ def sharpness(image: Image, around_px: tuple[float, float] | None = None, half_p
 
 def _grey(image: Image) -> Image:
     return image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
-
-
-def settings_tried(
-    read: Callable[[], Sequence[CameraSetting]],
-    adjust: Callable[[str, float], Sequence[str]],
-    of_a_frame: Callable[[], Mapping[str, float | None]],
-) -> str:
-    """Try each setting of a camera that may be changed now but focus, and return their names.
-
-    Each is changed by a little, read back, seen on new frames, and put back. A focus is left alone: its motor
-    may not come back to the calibrated place. ``read`` and ``adjust`` are as in `drivers.interfaces.Camera`;
-    ``of_a_frame`` returns the settings of a frame exposed from now on. Raises PromiseBroken, and NotTried if
-    there is none to try.
-    """
-
-    def change(name: str, value: float) -> float:
-        """Set a value, and return the one that is read back."""
-        notes = adjust(name, value)
-        now = next((one.value for one in read() if one.name == name), None)
-        if now is None:
-            raise PromiseBroken(f"{name} is not known after it was set to {value:.6g}")
-        message = f"{name} is {now:.6g} where {value:.6g} was set, and no note says so"
-        expect(_same(now, value) or notes, message)
-        return now
-
-    tried = []
-    for one in read():
-        other = _beside(one)
-        if other is None or one.value is None:
-            continue
-        try:
-            now = change(one.name, other)
-            values = (of_a_frame().get(one.name) for _ in range(SETTING_FRAMES))
-            seen = next((value for value in values if value is not None), None)
-            after = f"exposed after {one.name} was set to {now:.6g}"
-            if seen is None:
-                raise PromiseBroken(f"none of {SETTING_FRAMES} frames {after} has its value")
-            expect(_same(seen, now), f"a frame {after} has {seen:.6g}")
-        except BaseException:
-            with suppress(Exception):  # the first error counts
-                adjust(one.name, one.value)
-            raise
-        change(one.name, one.value)
-        tried.append(one.name)
-    if not tried:
-        raise NotTried("it has no setting but focus that can be changed now")
-    return ", ".join(tried)
-
-
-def _beside(one: CameraSetting) -> float | None:
-    """A value beside the present one, within the bounds; None if it is not to be tried."""
-    if one.name == "focus" or one.value is None or one.automatic or one.refusal:
-        return None
-    by = max(one.step, SETTING_PART * abs(one.value)) or SETTING_PART * (one.maximum - one.minimum)
-    if one.step:
-        by = math.floor(by / one.step + ROUNDING) * one.step
-    within = (other for other in (one.value + by, one.value - by) if one.minimum <= other <= one.maximum)
-    return next(within, None) if by > 0.0 else None
-
-
-def _same(one: float, other: float) -> bool:
-    return math.isclose(one, other, rel_tol=ROUNDING, abs_tol=1e-12)

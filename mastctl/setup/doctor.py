@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from importlib.util import find_spec
 from pathlib import Path
 from shlex import quote
 from typing import Any, Literal
@@ -20,7 +21,7 @@ from calib.errors import BadFile
 from calib.files.mast_file import load_rig
 from drivers.errors import BadOptions, CameraBusy, DriverError, NoCamera, NoPermission
 from drivers.faults import PAN_TILT
-from drivers.hardware import DeviceSettings, clock_for, is_hardware
+from drivers.hardware import DeviceSettings, is_hardware
 from drivers.registry import OURS, InstalledDriver, UnitBench, driver_of, installed_drivers
 from drivers.servo_bus.bench import ServoBench, line_arguments
 from mastctl.config import Config, check_cameras, load_config
@@ -158,22 +159,15 @@ def _head_line(config: Config, machine: ExaminedMachine) -> Findings:
 
 
 def _simulation(config: Config) -> Findings:
-    """Whether what simulates can be had."""
-    head, cameras = config.hardware.pan_tilt, config.hardware.cameras.values()
-    if not is_hardware("simulated", "head", head.driver) and not any(
-        is_hardware("simulated", "camera", camera.driver) for camera in cameras
-    ):
-        return
-    try:
-        clock_for(config.hardware)
-        import numba
-    except BadOptions as error:
-        yield DoctorFinding("simulation", "bad", str(error), CORRECT)
-    except ImportError:
-        message = "numba is not installed, which renders what simulated cameras see"
-        yield DoctorFinding("simulation", "bad", message, "pip install 'mastctl[sim]'")
-    else:
-        yield DoctorFinding("simulation", "good", f"a simulated rover, rendered by numba {numba.__version__}")
+    """Whether what simulates can be had; a configuration's other options are the daemon's to judge."""
+    cameras = config.hardware.cameras.values()
+    simulated = is_hardware("simulated", "head", config.hardware.pan_tilt.driver)
+    if simulated or any(is_hardware("simulated", "camera", camera.driver) for camera in cameras):
+        if find_spec("numba") is None:
+            message = "numba is not installed, which renders what simulated cameras see"
+            yield DoctorFinding("simulation", "bad", message, "pip install 'mastctl[sim]'")
+        else:
+            yield DoctorFinding("simulation", "good", "a simulated rover, rendered by numba")
 
 
 def _camera(name: str, camera: DeviceSettings, *, in_use: bool) -> DoctorFinding:
