@@ -8,14 +8,14 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Generator, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+from calib.errors import BadFile
 from drivers.clock import SystemClock
 from drivers.errors import DriverError
 from drivers.hardware import DeviceSettings, HardwareSettings, is_hardware
@@ -35,6 +35,7 @@ STOPS_WITHIN_S = 3.0
 ANYWHERE: tuple[Angles, Angles] = ((-math.pi, math.pi), (-math.pi / 2, math.pi / 2))
 """Where a head may be moved of which nothing is known."""
 SIMULATED_CAMERA = "navcam_left"
+HARDWARE = pytest.StashKey[tuple[HardwareSettings, Bounds | None]]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -71,18 +72,22 @@ def pytest_configure(config: pytest.Config) -> None:
     for low, high in _own_limits(config) or ():
         if not low < high:
             raise pytest.UsageError(f"--limits: {low:g} {high:g} where the lower angle first is expected")
-    _options(config)
+    try:
+        config.stash[HARDWARE] = _hardware(config)
+    except BadFile as error:
+        raise pytest.UsageError(str(error)) from None
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Give the tests of cameras each camera that the command line names."""
     if "camera_name" in metafunc.fixturenames:
-        metafunc.parametrize("camera_name", _camera_names(metafunc.config), scope="session")
+        cameras = metafunc.config.stash[HARDWARE][0].cameras
+        metafunc.parametrize("camera_name", list(cameras), scope="session")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Function]) -> None:
     """Leave out the tests of what the command line does not name."""
-    heads, cameras = config.option.camera is None, bool(_camera_names(config))
+    heads, cameras = config.option.camera is None, config.stash[HARDWARE][0].cameras
     items[:] = [one for one in items if (heads if "head" in one.fixturenames else cameras)]
 
 
@@ -102,17 +107,14 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, object, o
 def opened_head(request: pytest.FixtureRequest) -> Iterator[HeadTrial]:
     """The head under test, opened once; stopped and closed at the end."""
     option, moves = request.config.option, _may_move(request.config)
-    with _refusals(), ExitStack() as stack:
-        if option.rig is None:
-            settings, bounds = device_settings(option.head, _options(request.config), "head", ""), None
-        else:
-            rig = load_config(Path(option.rig))
-            settings, bounds = rig.hardware, bounds_of(rig)
-            if is_hardware("replayed", "head", settings.pan_tilt.driver):
-                pytest.skip("a replayed head is at recorded poses only; there is no motion to test")
-        own = _own_limits(request.config)
-        opened = head_under_test(settings, bounds, option.reach, option.speed, own, moves=moves)
-        trial = stack.enter_context(opened)
+    settings, bounds = request.config.stash[HARDWARE]
+    if is_hardware("replayed", "head", settings.pan_tilt.driver):
+        pytest.skip("a replayed head is at recorded poses only; there is no motion to test")
+    own = _own_limits(request.config)
+    with (
+        _refusals(),
+        head_under_test(settings, bounds, option.reach, option.speed, own, moves=moves) as trial,
+    ):
         yield trial
         if moves and not trial.closed:
             _stop(trial)
@@ -129,24 +131,21 @@ def head(request: pytest.FixtureRequest, opened_head: HeadTrial) -> HeadTrial:
 @pytest.fixture(scope="session")
 def camera(request: pytest.FixtureRequest, camera_name: str) -> Iterator[CameraTrial]:
     """A camera under test, after the head if it is one of a simulator that looks from it."""
-    option, size_px = request.config.option, None
+    settings, bounds = request.config.stash[HARDWARE]
+    device, size_px = settings.cameras[camera_name], None
     with _refusals(), ExitStack() as stack:
-        if option.rig is None:
-            settings = device_settings(option.camera, _options(request.config), "camera", camera_name)
-        else:
-            config = load_config(Path(option.rig))
-            bounds = bounds_of(config)
+        if bounds is not None:
             assert bounds.stored is not None
             size_px = bounds.stored.rig.cameras[camera_name].model.size_px
-            settings = replace(config.hardware, cameras={camera_name: config.hardware.cameras[camera_name]})
-            if is_hardware("simulated", "camera", settings.cameras[camera_name].driver):
+            if is_hardware("simulated", "camera", device.driver):
                 stack.enter_context(head_beside(settings, bounds, SystemClock(), moves=False))()
 
         def opened() -> Camera:
-            return stack.enter_context(open_one_camera(settings, camera_name))
+            one = replace(settings, cameras={camera_name: device})
+            return stack.enter_context(open_one_camera(one, camera_name))
 
-        again = is_hardware("real", "camera", settings.cameras[camera_name].driver)
-        yield CameraTrial(camera_name, opened(), size_px, option.seconds, opened if again else None)
+        again = opened if is_hardware("real", "camera", device.driver) else None
+        yield CameraTrial(camera_name, opened(), size_px, request.config.option.seconds, again)
 
 
 @contextmanager
@@ -188,20 +187,28 @@ def head_under_test(
         yield trial
 
 
-def device_settings(driver: str, options: Mapping[str, Any], kind: str, name: str) -> HardwareSettings:
-    """Return the settings that open one device by its driver.
+def _hardware(config: pytest.Config) -> tuple[HardwareSettings, Bounds | None]:
+    """What the command line names, and what bounds its moves. Raises BadFile, UsageError.
 
-    The options of a simulated one are the section ``simulation``, over that of the packaged rover.
+    The options of a simulated device are the section ``simulation``, over that of the packaged rover.
     """
-    if is_hardware("simulated", "head", driver):
+    option = config.option
+    if option.rig is not None:
+        rig = load_config(Path(option.rig))
+        return rig.hardware, bounds_of(rig)
+    try:
+        driver_options = dict(**json.loads(option.options))
+    except (ValueError, TypeError) as error:
+        raise pytest.UsageError(f"--options: a JSON object is expected: {error}") from None
+    driver = option.head or option.camera
+    simulated = is_hardware("simulated", "head", driver)
+    device = DeviceSettings(driver, {} if simulated else driver_options)
+    cameras = {} if option.head else {SIMULATED_CAMERA if simulated else "camera": device}
+    if simulated:
         packaged = load_config(None).hardware
-        simulation = {**packaged.simulation, **options}
-        settings = replace(packaged, cameras={}, simulation=simulation, pan_tilt=DeviceSettings(driver))
-        return replace(settings, cameras={name: DeviceSettings(driver)}) if kind == "camera" else settings
-    device = DeviceSettings(driver, options)
-    if kind == "camera":
-        return HardwareSettings(DeviceSettings("none"), {name: device})
-    return HardwareSettings(device, {})
+        simulation = {**packaged.simulation, **driver_options}
+        return replace(packaged, cameras=cameras, simulation=simulation, pan_tilt=device), None
+    return HardwareSettings(device if option.head else DeviceSettings("none"), cameras), None
 
 
 @contextmanager
@@ -217,29 +224,10 @@ def _may_move(config: pytest.Config) -> bool:
     return bool(config.option.motion) or is_hardware("simulated", "head", config.option.head or "")
 
 
-def _camera_names(config: pytest.Config) -> Sequence[str]:
-    option = config.option
-    if option.rig is not None:
-        return list(load_config(Path(option.rig)).hardware.cameras)
-    simulated = is_hardware("simulated", "camera", option.camera or "")
-    return [] if option.camera is None else [SIMULATED_CAMERA if simulated else "camera"]
-
-
 def _own_limits(config: pytest.Config) -> tuple[Angles, Angles] | None:
     """The driver's own ends of pan and tilt."""
     ends = config.option.limits
     return None if ends is None else ((ends[0], ends[1]), (ends[2], ends[3]))
-
-
-def _options(config: pytest.Config) -> dict[str, Any]:
-    """Read the driver's options. Raises UsageError."""
-    try:
-        options = json.loads(config.option.options)
-    except ValueError as error:
-        raise pytest.UsageError(f"--options: a JSON object is expected: {error}") from None
-    if not isinstance(options, dict):
-        raise pytest.UsageError("--options: a JSON object is expected")
-    return options
 
 
 def _stop(trial: HeadTrial) -> None:
