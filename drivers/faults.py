@@ -28,9 +28,6 @@ _MAX_SCRIPT_BYTES = 1_000_000
 PAN_TILT = "pan_tilt"
 """The name of the head among the devices."""
 
-LOG = "log"
-"""The name of the daemon's log among the devices."""
-
 
 @dataclass(frozen=True)
 class Word:
@@ -133,13 +130,6 @@ CAMERA_WORDS: Mapping[str, Word] = MappingProxyType(
     }
 )
 
-LOG_WORDS: Mapping[str, Word] = MappingProxyType(
-    {
-        "stalled": Word("no program reads the daemon's stderr and stdout: its output waits", {}),
-    }
-)
-"""Words of the daemon's log, which is a device of its own here."""
-
 WHEN: Mapping[str, float] = MappingProxyType({"after_s": 0.0, "for_s": math.inf})
 """Parameters of every word: it begins ``after_s`` after it is set and lasts ``for_s`` seconds."""
 
@@ -224,7 +214,7 @@ class FaultPanel:
 
     def __init__(self, now_s: Callable[[], float], cameras: Iterable[str]) -> None:
         self._now_s = now_s
-        self._words: dict[str, Mapping[str, Word]] = {PAN_TILT: HEAD_WORDS, LOG: LOG_WORDS}
+        self._words: dict[str, Mapping[str, Word]] = {PAN_TILT: HEAD_WORDS}
         self._words |= dict.fromkeys(cameras, CAMERA_WORDS)
         self._lock = threading.Lock()
         self._entries: dict[tuple[str, str], tuple[_Entry, ...]] = {}

@@ -13,7 +13,7 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
-from urllib.parse import quote
+from urllib.parse import quote, urlsplit
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, WithJsonSchema, model_validator
 
@@ -384,18 +384,11 @@ def parse_address(text: str) -> Listen:
         if len(os.fsencode(text)) > LONGEST_SOCKET_PATH:
             raise ValueError(f"'{text[:40]}...' is longer than {LONGEST_SOCKET_PATH} bytes, a socket's most")
         return Listen(socket=Path(text).absolute())
-    host, colon, port = text.rpartition(":")
-    if host.startswith("[") and host.endswith("]"):
-        host = host[1:-1]
-    elif ":" in host:
-        colon = ""
-    if not (
-        colon
-        and host.strip()
-        and host.isprintable()
-        and port.isascii()
-        and port.isdecimal()
-        and int(port[:9]) <= 65535
-    ):
+    try:
+        parts = urlsplit(f"//{text}")
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+    if not host or port is None or "@" in text or not text.isprintable():
         raise ValueError(f"'{text[:80]}' where HOST:PORT (127.0.0.1:8420, [::1]:8420) or a path is expected")
-    return Listen(host=host, port=int(port))
+    return Listen(host=host, port=port)

@@ -22,14 +22,12 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from types import TracebackType
 
 import uvicorn
 from starlette.types import ASGIApp
 
 from drivers.clock import Clock
-from drivers.faults import LOG
 from drivers.hardware import Hardware
 from mastctl import signals
 from mastctl.config import Config, Listen
@@ -37,7 +35,6 @@ from mastctl.errors import MastctlError, Unable, one_line
 from mastctl.http.guard import EntryRules
 from mastctl.http.tokens import Access, TokenList
 from mastctl.http.waiting import SilentConnections, Streams, Waiting
-from mastctl.logs import stall_while
 from mastctl.safety.state_folder import StateFolder
 from mastctl.service.service import Service
 from mastctl.service.stopping import StopsHang
@@ -225,10 +222,6 @@ def _opened(config: Config, clock: Clock | None, *, own_process: bool) -> Iterat
         for kept in (service.folder, service.head_folder):  # a stop finds the daemon of a head by either
             if kept is not None:
                 kept.note_daemon(config.path, url, stop_path)
-        rover = service.hardware.simulation
-        if rover is not None:  # a fault of it delays this process' log, as an unread pipe does
-            stall_while(lambda: rover.faults.find(LOG, "stalled", service.clock.now_s()) is not None)
-            stack.callback(stall_while, lambda: False)
         yield _Opened(service, listener, url, _entry_rules(service, url), own_process)
 
 
@@ -390,60 +383,32 @@ def _suspend(service: Service) -> None:
 @contextlib.contextmanager
 def _listening(listen: Listen) -> Iterator[tuple[socket.socket, str]]:
     """Listen; yield the socket, and the address as it is (port 0 has become a number)."""
-    if listen.socket is not None:
-        listener = _unix_socket(listen.socket)
-        url = listen.url
-    else:
-        listener = _tcp_socket(listen)
-        url = listen.model_copy(update={"port": listener.getsockname()[1]}).url
-    try:
-        yield listener, url
-    finally:
-        listener.close()
-        if listen.socket is not None:
-            listen.socket.unlink(missing_ok=True)
-
-
-def _tcp_socket(listen: Listen) -> socket.socket:
-    family = socket.AF_INET6 if ":" in listen.host else socket.AF_INET
+    url, path = listen.url, listen.socket
+    family = socket.AF_UNIX if path else socket.AF_INET6 if ":" in listen.host else socket.AF_INET
     # The protocol is named because asyncio switches Nagle's delay off only where it stands: 40 ms an answer.
-    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
-    try:
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        # Inherited by each connection, which a client that stops reading would otherwise keep for ever.
-        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(1000 * UNREAD_S))
-        listener.bind((listen.host, listen.port))
-        # Listening at once: SO_REUSEADDR lets two sockets bind as long as neither of them listens.
-        listener.listen()
-    except OSError as error:
-        listener.close()
-        raise _no_address(listen.url, error) from None
-    return listener
-
-
-def _unix_socket(path: Path) -> socket.socket:
-    """Bind a Unix socket that only this user may use; a socket left behind by a dead daemon is replaced."""
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        if path.is_socket() and not _answers(path):
-            path.unlink()
-        os.fchmod(listener.fileno(), 0o600)  # bind takes it over; a umask would be every thread's
-        listener.bind(str(path))
-        listener.listen()
-    except OSError as error:
-        listener.close()
-        raise _no_address(str(path), error) from None
-    return listener
-
-
-def _answers(path: Path) -> bool:
-    """Whether a program listens at a Unix socket."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+    with socket.socket(family, socket.SOCK_STREAM, 0 if path else socket.IPPROTO_TCP) as listener:
         try:
-            probe.connect(str(path))
-        except ConnectionRefusedError:
-            return False
-    return True
+            if path is None:
+                listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                # Inherited by each connection, which a client that reads nothing would keep for ever.
+                listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(1000 * UNREAD_S))
+                listener.bind((listen.host, listen.port))
+                url = listen.model_copy(update={"port": listener.getsockname()[1]}).url
+            else:
+                with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+                    if path.is_socket() and probe.connect_ex(str(path)) == errno.ECONNREFUSED:
+                        path.unlink()  # a dead daemon has left it
+                os.fchmod(listener.fileno(), 0o600)  # bind takes it over; a umask would be every thread's
+                listener.bind(str(path))
+            # Listening at once: SO_REUSEADDR lets two sockets bind as long as neither of them listens.
+            listener.listen()
+        except OSError as error:
+            raise _no_address(url if path is None else str(path), error) from None
+        try:
+            yield listener, url
+        finally:
+            if path is not None:
+                path.unlink(missing_ok=True)
 
 
 def _no_address(where: str, error: OSError) -> MastctlError:

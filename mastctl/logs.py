@@ -16,7 +16,7 @@ import select
 import sys
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cache
 from queue import Full, Queue
 from typing import Literal
@@ -76,14 +76,6 @@ def formatter(wanted: LogFormat | None, descriptor: int | None = None) -> loggin
 
 KEPT = 1000  # texts that wait for an output that does not flow
 FLUSH_S = 1.0
-STALLED_S = 0.05
-
-_stalls: list[Callable[[], bool]] = []
-
-
-def stall_while(stalled: Callable[[], bool]) -> None:
-    """Have outputs of this process behave as if unread, while the function given last returns true."""
-    _stalls[:] = [stalled]
 
 
 class QueuedText(io.TextIOBase):
@@ -138,8 +130,6 @@ class QueuedText(io.TextIOBase):
     def _write(self, left: bytes) -> None:
         """Write one text whole; it is lost where nothing can be written (closed, disk full)."""
         while left:
-            while any(stalled() for stalled in _stalls):
-                time.sleep(STALLED_S)
             try:
                 left = left[os.write(self._descriptor, left) :]
             except BlockingIOError:  # the process that started this one shares the pipe, without waiting

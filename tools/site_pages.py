@@ -270,7 +270,7 @@ def fault_words_page() -> str:
     """Return the fault words of each simulated device with their parameters."""
     explained = "[Faults on purpose](../../drivers.md#faults-on-purpose) explains them."
     lines = ["# Fault words", "", f"Written from the code; {explained}", ""]
-    kinds = {"a head": faults.HEAD_WORDS, "a camera": faults.CAMERA_WORDS, "the log": faults.LOG_WORDS}
+    kinds = {"a head": faults.HEAD_WORDS, "a camera": faults.CAMERA_WORDS}
     for kind, words in kinds.items():
         rows = []
         for name, word in words.items():

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Any
 
-from drivers.faults import CAMERA_WORDS, HEAD_WORDS, LOG_WORDS
+from drivers.faults import CAMERA_WORDS, HEAD_WORDS
 from hil_tests.support.living_daemon import Asker
 from hil_tests.support.soak_ledger import SEES, Ledger
 
@@ -380,12 +380,10 @@ def _rival(client: SoakClient) -> None:
 def _set_fault(client: SoakClient) -> None:
     """Set a word for a while, and some time later another."""
     kind = client.draw.random()
-    if kind < 0.45:
+    if kind < 0.5:
         device, word = "pan_tilt", client.draw.choice(sorted(HEAD_WORDS))
-    elif kind < 0.9:
-        device, word = client.draw.choice(SEES), client.draw.choice(sorted(CAMERA_WORDS))
     else:
-        device, word = "log", client.draw.choice(sorted(LOG_WORDS))
+        device, word = client.draw.choice(SEES), client.draw.choice(sorted(CAMERA_WORDS))
     for_s = client.draw.uniform(0.3, 6.0)
     parameters = (
         {"for_s": for_s, "seed": client.draw.randrange(1000)} if _seeded(device, word) else {"for_s": for_s}
@@ -400,7 +398,7 @@ def _set_fault(client: SoakClient) -> None:
 
 
 def _seeded(device: str, word: str) -> bool:
-    words = {"pan_tilt": HEAD_WORDS, "log": LOG_WORDS}.get(device, CAMERA_WORDS)
+    words = HEAD_WORDS if device == "pan_tilt" else CAMERA_WORDS
     return "seed" in words[word].parameters
 
 

@@ -6,8 +6,6 @@ import threading
 import time
 from typing import Any
 
-from drivers.faults import LOG
-
 SEES = ("navcam_left", "navcam_right", "hazcam_left", "hazcam_right")
 
 AFTER_S = 10.0
@@ -69,8 +67,7 @@ class Ledger:
     def fault_set(self, device: str, word: str, begin_s: float, end_s: float) -> None:
         """Note a fault that was set, with its times (CLOCK_MONOTONIC)."""
         with self._lock:
-            if device != LOG:
-                self._lacking.discard("fault of a camera" if device in SEES else "fault of the head")
+            self._lacking.discard("fault of a camera" if device in SEES else "fault of the head")
             self._faults.append((device, word, begin_s, end_s))
 
     def faults_taken_back(self) -> None:

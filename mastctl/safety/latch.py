@@ -96,7 +96,7 @@ class Latch:
         if not self.entries:
             return ""
         if self.folder.is_temporary:
-            return self.folder.why_temporary or "this daemon keeps its state in a temporary folder"
+            return "this daemon keeps its state in a temporary folder"
         return "" if self._on_disk == self.entries else self._problem or "the disk has not confirmed it yet"
 
     def release(self, reason: str, name: str) -> tuple[Latched, ...]:

@@ -128,16 +128,12 @@ class StateFile:
 class StateFolder:
     """A folder that is this program's alone until it is closed; `of`, `temporary` and `take_head` make one.
 
-    ``is_temporary``: it goes when it is closed; ``why_temporary``: why what is kept there is lost with this
-    daemon, though that was not wanted, else empty.
+    ``is_temporary``: it goes when it is closed.
     """
 
-    def __init__(
-        self, path: Path, *, is_temporary: bool = False, why_temporary: str = "", of_head: str = ""
-    ) -> None:
+    def __init__(self, path: Path, *, is_temporary: bool = False, of_head: str = "") -> None:
         self.path = path
         self.is_temporary = is_temporary
-        self.why_temporary = why_temporary
         try:
             self._lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         except OSError as error:
@@ -155,34 +151,30 @@ class StateFolder:
             raise StateInUse(message) from None
 
     @classmethod
-    def temporary(cls, why: str = "") -> StateFolder:
-        """Make a folder that goes with the daemon; ``why`` that was not wanted, if so."""
-        return cls(Path(tempfile.mkdtemp(prefix="mastctl-state-")), is_temporary=True, why_temporary=why)
+    def temporary(cls) -> StateFolder:
+        """Make a folder that goes with the daemon."""
+        return cls(Path(tempfile.mkdtemp(prefix="mastctl-state-")), is_temporary=True)
 
     @classmethod
     def of(cls, named: Path | None, config: Path, address: str | None) -> StateFolder:
         """Take the folder of a configuration and an address, and make it if it does not exist.
 
         ``address`` is None for one that does not come again: without a ``named`` folder (``state.folder``, or
-        that of systemd) it is temporary. A usual place that cannot be made is replaced by a temporary one,
-        since nothing can be kept there; one that was named is insisted upon, since something may. Raises
-        BadFile, StateInUse.
+        that of systemd) it is temporary. Raises BadFile, StateInUse.
         """
-        path = named = named or _of_systemd()
+        if address is None and not named and not _of_systemd():
+            return cls.temporary()
+        path = folder_of(named, config, address or "")
         if path is None:
-            if address is None:
-                return cls.temporary()
-            try:
-                path = usual_folder(config, address)
-            except RuntimeError as error:  # this user has no home
-                return cls.temporary(str(error))
+            message = "this user has no home for the state folder; name a folder that can be made"
+            raise BadFile(config, "state.folder", message)
         try:
             path.mkdir(mode=0o700, parents=True, exist_ok=True)
         except OSError as error:
-            bad = BadFile(path, "", f"the state folder cannot be made: {error.strerror or error}")
-            if named is None:
-                return cls.temporary(str(bad))
-            raise bad from None
+            message = (
+                f"cannot be made: {error.strerror or error}; name another state folder (key state.folder)"
+            )
+            raise BadFile(path, "", message) from None
         return cls(path)
 
     def note_daemon(self, config: Path, url: str, stop_socket: Path | None) -> None:

@@ -71,7 +71,7 @@ from mastctl.service.masts import MastInUse, Masts, read_mast
 from mastctl.service.metrics import Metrics
 from mastctl.service.places import Targets, places
 from mastctl.service.steering import Steering
-from mastctl.service.stopping import Stopping, StopThreads, state_faults
+from mastctl.service.stopping import Stopping, StopThreads, latch_faults
 
 log = logging.getLogger(__name__)
 
@@ -398,7 +398,7 @@ class Service:
             *self.recorder.faults(),
             *self.audit.faults(),
             *self.strangers.faults(),
-            *state_faults(self.folder, self.latch, self.started_s),
+            *latch_faults(self.latch),
         )
 
     def _use_mast(self, mast: MastInUse) -> None:

@@ -22,11 +22,9 @@ from mastctl.devices.devices import Devices
 from mastctl.errors import MastctlError, NotNow, Unable
 from mastctl.motion.track import Tracker
 from mastctl.safety.latch import Estopped, Latch
-from mastctl.safety.state_folder import StateFolder
 
 KEPT_S = 1.0  # what the disk is given before an emergency stop is answered without it
 STRAGGLER_S = 1.0  # what a reset waits for stops that follow one that was confirmed already
-STATE = "state"
 THREADS = 4
 OVERDUE_S = 1.5  # a stop is given 1 s by the devices
 
@@ -195,13 +193,11 @@ class Stopping:
         return Estopped(latched_sentence(causes)) if causes else None
 
 
-def state_faults(folder: StateFolder, latch: Latch, started_s: float) -> Iterator[StandingFault]:
-    """Yield what keeps state from outliving a daemon that ``started_s``, where it should."""
-    if folder.why_temporary:
-        above = ", an emergency stop above all" if latch.folder is folder else ", but for an emergency stop"
-        message = f"nothing outlives this daemon{above}: {folder.why_temporary}"
-        yield StandingFault(STATE, "state_not_kept", message, started_s, "the daemon has a state folder")
-    elif latch.not_kept and not latch.folder.is_temporary:
+def latch_faults(latch: Latch) -> Iterator[StandingFault]:
+    """Yield what keeps an emergency stop from outliving the daemon, where it should."""
+    if latch.not_kept and not latch.folder.is_temporary:
         where = "is kept in memory only" if latch.entries else "would not survive a restart"
         message = f"an emergency stop {where}: {latch.not_kept}"
-        yield StandingFault(STATE, "latch_not_kept", message, latch.since_s, "the disk takes it, or a reset")
+        yield StandingFault(
+            "state", "latch_not_kept", message, latch.since_s, "the disk takes it, or a reset"
+        )

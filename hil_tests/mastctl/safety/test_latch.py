@@ -180,16 +180,14 @@ def test_systemd_names_the_folder_and_the_configuration_before_it(
         made.close()
 
 
-def test_only_the_usual_state_folder_may_be_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_state_folder_that_cannot_be_made_refuses_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
-    made = StateFolder.of(None, tmp_path / "rover.yaml", "http://127.0.0.1:1")
-    assert made.is_temporary
-    assert "cannot be made" in made.why_temporary
-    made.close()
-    assert not made.path.exists()
-    with pytest.raises(BadFile, match="cannot be made"):
-        StateFolder.of(tmp_path / "file" / "in", tmp_path / "rover.yaml", "http://127.0.0.1:1")
+    for named in (None, tmp_path / "file" / "in"):
+        with pytest.raises(BadFile, match=r"cannot be made: Not a directory; name another.*state\.folder"):
+            StateFolder.of(named, tmp_path / "rover.yaml", "http://127.0.0.1:1")
 
 
 # The daemon

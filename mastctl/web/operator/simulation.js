@@ -46,7 +46,7 @@ export class Simulation {
     try {
       const { devices } = await get("/simulation/words");
       this.words = devices;
-      put(this.device, Object.keys(devices).map((name) => h("option", { value: name }, name === "log" ? "the daemon's log" : called(name))));
+      put(this.device, Object.keys(devices).map((name) => h("option", { value: name }, called(name))));
       this.offer();
     } catch (error) {
       say(this.said, error.message);
