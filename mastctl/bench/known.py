@@ -242,7 +242,8 @@ class BenchKnowledge:
         nothing."""
         boards = dict(self.now.boards)
         for name, _, look in self.looks:
-            boards.setdefault(name, self._board_from(look))
+            if name not in boards:
+                boards[name] = self._board_from(look)
         self.now = replace(self.now, boards=boards)
         placed = {name for _, name in self.fitted.rover_from_board} if self.fitted else set(boards)
         self.shots = [
