@@ -25,7 +25,7 @@ from typing import Any, cast
 from calib.errors import BadFile
 from calib.files import replace_bytes
 from drivers.errors import DriverError
-from mastctl.answers import BenchRunRecord, BenchRuns, BenchState
+from mastctl.answers import BenchRunRecord, BenchRuns
 from mastctl.bench.runs import (
     HOLDER,
     SHOWN,
@@ -47,8 +47,6 @@ TICK_S = 0.25
 ENDS_S = 5.0
 FREE_BYTES = 500_000_000
 """Sixty pictures of two cameras take a tenth of it."""
-
-GOES_ON = "everything seen is kept, and the run can go on"
 
 Lend = Callable[[str], tuple[str, Callable[[], None]]]
 """Returns a token for a client of this name, and what revokes it."""
@@ -167,7 +165,7 @@ class BenchOperation:
     def leave(self, by: str) -> BenchRunRecord:
         """End the run and its motion; it can go on later. Raises NotNow ``bench_idle``."""
         work = self._working()
-        self._end(work, "interrupted", "left", f"{by} ended the run; {GOES_ON}")
+        self._interrupt(work, "left", f"{by} ended the run")
         return work.run
 
     def forget(self, name: str) -> BenchRuns:
@@ -184,9 +182,8 @@ class BenchOperation:
     def close(self) -> None:
         """End the worker, if one is at work, and begin no other; never raises."""
         self._closed = True
-        work = self._work
-        if work is not None:
-            self._end(work, "interrupted", "closing", f"the daemon ended; {GOES_ON}")
+        if self._work is not None:
+            self._interrupt(self._work, "closing", "the daemon ended")
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[BenchRunRecord | None]:
@@ -251,7 +248,7 @@ class BenchOperation:
             threading.Thread(target=self._follow, args=(work,), name="bench", daemon=True).start()
         except (OSError, RuntimeError) as error:
             sentence = f"the calibration program cannot be started: {error}"
-            self._end(work, "interrupted", "no_process", sentence)
+            self._interrupt(work, "no_process", sentence)
             raise Unable("no_process", sentence) from None
         log.info("bench calibration %s begins, requested by %s", folder.name, run["by"])
         self._publish(work)
@@ -266,10 +263,11 @@ class BenchOperation:
                     try:
                         run = work.link.recv()
                     except (EOFError, OSError):
-                        return self._died(work)
+                        work.process.join(ENDS_S)
+                        return self._interrupt(work, "program_ended", _how_it_ended(work.process.exitcode))
                     if run["step"] == "over":
                         work.process.join(ENDS_S)  # published afterwards: the next client may steer then
-                        return self._end(work, run["state"], run["code"], run["sentence"], run)
+                        return self._end(work, run)
                     with self._changing:
                         work.run = work.run if work.over.is_set() else run
                     self._publish(work)
@@ -280,30 +278,18 @@ class BenchOperation:
                 except MastctlError as error:
                     reason = (getattr(error, "detail", None) or {}).get("how", error)
                     code = "stopped" if self._leases.was_stopped(work.lease) else "taken"
-                    return self._end(work, "interrupted", code, f"{reason}; {GOES_ON}")
+                    return self._interrupt(work, code, str(reason))
         return None
 
-    def _died(self, work: _Work) -> None:
-        """End a run whose worker is over and has not said why."""
-        work.process.join(ENDS_S)
-        code = work.process.exitcode
-        how = f"ended with exit code {code}"
-        if code is not None and code < 0:
-            how = f"was ended by signal {-code} ({signal.strsignal(-code)})"
-        self._end(work, "interrupted", "program_ended", f"the calibration program {how}; {GOES_ON}")
+    def _interrupt(self, work: _Work, code: str, reason: str) -> None:
+        """End a run that has not ended itself."""
+        sentence = f"{reason}; everything seen is kept, and the run can go on"
+        ended = {"state": "interrupted", "code": code, "sentence": sentence}
+        run = {**work.run, **ended, "sentences": [*work.run["sentences"], sentence]}
+        self._end(work, cast(BenchRunRecord, run))
 
-    def _end(
-        self,
-        work: _Work,
-        state: BenchState,
-        code: str | None,
-        sentence: str,
-        run: BenchRunRecord | None = None,
-    ) -> None:
-        """End a run, once: the worker first, then its right to steer with what moves by it.
-
-        ``run`` is the worker's own last record, which has the sentence already.
-        """
+    def _end(self, work: _Work, run: BenchRunRecord) -> None:
+        """End a run, once: the worker first, then its right to steer with what moves by it."""
         with self._changing:
             if work.over.is_set():
                 return
@@ -318,18 +304,17 @@ class BenchOperation:
         work.revoke_token()
         if work.process.pid is not None:
             work.process.join(ENDS_S)
-        sentences = [*work.run["sentences"], sentence] if run is None else run["sentences"]
-        last = {
-            "state": state, "step": "over", "code": code, "sentence": sentence, "sentences": sentences,
-            "mast_file": mast_file(work.run) if state == "done" else None,
+        done = run["state"] == "done"
+        made = {
+            "mast_file": mast_file(run) if done else None,
             "report": work.folder.name if work.folder.page.is_file() else None,
-        }  # fmt: skip
-        work.run = cast(BenchRunRecord, {**(run or work.run), **last})
+        }
+        work.run = run = cast(BenchRunRecord, {**run, "step": "over", **made})
         try:
-            work.folder.write(work.run)
+            work.folder.write(run)
         except BadFile as error:
             log.error("how the bench calibration ended is not kept: %s", error)
-        (log.info if state == "done" else log.warning)("bench calibration %s: %s", work.run["name"], sentence)
+        (log.info if done else log.warning)("bench calibration %s: %s", run["name"], run["sentence"])
         self._publish(work)
 
     def _publish(self, work: _Work) -> None:
@@ -340,6 +325,12 @@ class BenchOperation:
 def mast_file(run: BenchRunRecord) -> str:
     """Return the name of the mast file that a run makes."""
     return f"bench-{run['name']}.yaml"
+
+
+def _how_it_ended(exitcode: int | None) -> str:
+    if exitcode is None or exitcode >= 0:
+        return f"the calibration program ended with exit code {exitcode}"
+    return f"the calibration program was ended by signal {-exitcode} ({signal.strsignal(-exitcode)})"
 
 
 def _check_space(masts: Path, state: Path) -> None:

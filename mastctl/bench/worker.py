@@ -20,7 +20,6 @@ from queue import SimpleQueue
 from typing import Any, cast
 
 from calib.adjust.result import BenchCalibration
-from calib.files.mast_file import joint_keys
 from calib.geometry.rig import Rig
 from calib.plan.placements import Placement
 from calib.survey.records import Survey
@@ -33,7 +32,7 @@ from mastctl.bench.run import BenchRun, Checked
 from mastctl.bench.runs import HOLDER, BenchJob
 from mastctl.bench.survey import fit_in_frame, keep_former, open_survey
 from mastctl.calibration.landing import expected_pointing
-from mastctl.calibration.run import checked_survey, conclude, fit_document, picked, with_fit
+from mastctl.calibration.run import checked_survey, conclude, mast_document, picked, with_fit
 from mastctl.calibration.verdict import judge
 from mastctl.client import Client
 from mastctl.errors import error_body, one_line
@@ -186,13 +185,9 @@ def saved(
         own |= {"pointings": checked.table(), "promised_px": checked.promised_px}
     file, _, page = conclude(survey, fit, verdict, rig, out, report, former, **own)
     document = {
-        **fit_document(survey, fit, verdict, file),
+        **mast_document(file),
         **numbers,
-        "joints": joint_keys(fit.rig.joints),
-        "terms": [term.as_json() for term in fit.terms],
-        "bows_m": as_json(fit.bows_m),
-        "gauges": list(fit.gauges),
-        "outliers": [outlier.sentence for outlier in fit.outliers],
+        **picked(fit, "seconds", "notes"),
         "survey": {"folder": str(survey.folder), "digest": survey.digest},
         "report": None if page is None else str(page),
     }

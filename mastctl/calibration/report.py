@@ -151,7 +151,7 @@ def sigma_table(survey: Survey, fit: FittedRig) -> Table | None:
     return Table(("measurements", "stated sigma", "found", "redundant numbers", "taken times"), rows)
 
 
-def finding_table(heading: str, findings: Sequence[Finding], most: int | None = None) -> Table | None:
+def finding_table(heading: str, findings: Sequence[Finding]) -> Table | None:
     """Return what hypotheses would gain, or None where none was tested."""
     if not findings:
         return None
@@ -163,7 +163,7 @@ def finding_table(heading: str, findings: Sequence[Finding], most: int | None = 
             f"{one.chance:.2g}",
             one.sentence if one.significant else "no more than chance",
         ]
-        for one in findings[:most]
+        for one in findings
     ]
     return Table((heading, "numbers", "gain in chi-square", "chance", ""), rows)
 

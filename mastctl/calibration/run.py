@@ -22,7 +22,7 @@ from calib.calibrate.paper import fit_paper
 from calib.calibrate.survey import fit_joint
 from calib.errors import BadFile, CalibError
 from calib.files import keep_previous, previous_path
-from calib.files.mast_file import StoredRig, save_rig
+from calib.files.mast_file import StoredRig, joint_keys, save_rig
 from calib.files.yaml_text import plain
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid
@@ -211,33 +211,17 @@ def sentence_of(finding: SurveyFinding) -> str:
     return str(finding).removeprefix(f"{finding.severity}: ")
 
 
-def fit_summary(
-    survey: Survey, fit: Calibration | BenchCalibration, verdict: CalibrationVerdict
-) -> dict[str, Any]:
-    """Return what mast files and commands report of a fit, as JSON or YAML."""
+def mast_document(saved: StoredRig) -> dict[str, Any]:
+    """Return what a command prints of a calibrated mast file with ``--json``: its ``fit`` and its mast."""
+    rig, large = saved.rig, ("covariance", "parameters")
+    kept = {key: value for key, value in rig.fit.items() if key not in large}
+    sigma = kept.get("sigma", {})
     return {
-        **as_json(picked(fit, "rms_px", "check_rms_px", "chi2", "degrees_of_freedom")),
-        "sigma": plain(fit.sigma),
-        "sigmas_found": sigmas_as_json(survey, fit),
-        "verdict": verdict.as_json(),
-    }
-
-
-def fit_document(
-    survey: Survey, fit: Calibration | BenchCalibration, verdict: CalibrationVerdict, saved: StoredRig
-) -> dict[str, Any]:
-    """Return what a command prints of a calibration with ``--json``."""
-    summary = fit_summary(survey, fit, verdict)
-    mast = fit.rig.mast
-    return {
-        **summary,
-        "mast": as_json(picked(mast, "translation_m", "rotation_rad", "axis_offset_m", "axis_twist_rad")),
+        **kept,
+        "mast": picked(rig.mast, "translation_m", "rotation_rad", "axis_offset_m", "axis_twist_rad"),
+        "joints": joint_keys(rig.joints),
         # The mast's own keys stand at the top beside the file's two sections.
-        "sigma": {**summary["sigma"]["mast"], **summary["sigma"]},
-        "seconds": fit.seconds,
-        "chi2_probability": as_json(fit.chi2_probability),
-        "degenerate": [picked(one, "parameters", "sentence") for one in fit.degenerate],
-        "notes": list(fit.notes),
+        "sigma": {**sigma.get("mast", {}), **sigma},
         "mast_file": {"path": str(saved.path), "digest": saved.digest},
     }
 
@@ -285,18 +269,18 @@ def with_fit(fit: Calibration | BenchCalibration, survey: Survey, verdict: Calib
     `calib.geometry.parameters.tangents`.
     """
     if isinstance(fit, Calibration):
-        method = picked(fit, "method", "mast_parameters")
-        own: dict[str, Any] = {"needed": [model.sentence for model in fit.wider if model.significant]}
-    else:
-        method = {"method": "bench"}
         own = {
-            "terms": [term.as_json() for term in fit.terms],
-            "bows_m": as_json(fit.bows_m),
-            "gauges": list(fit.gauges),
+            **picked(fit, "method", "mast_parameters"),
+            "needed": [model.sentence for model in fit.wider if model.significant],
         }
+    else:
+        terms = [term.as_json() for term in fit.terms]
+        own = {"method": "bench", "terms": terms, **picked(fit, "bows_m", "gauges")}
     whole = {
-        **method,
-        **fit_summary(survey, fit, verdict),
+        **picked(fit, "rms_px", "check_rms_px", "chi2", "degrees_of_freedom"),
+        "sigma": plain(fit.sigma),
+        "sigmas_found": sigmas_as_json(survey, fit),
+        "verdict": verdict.as_json(),
         **own,
         "outliers": [outlier.name for outlier in fit.outliers],
         "degenerate": [direction.sentence for direction in fit.degenerate],

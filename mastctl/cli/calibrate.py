@@ -210,13 +210,13 @@ def _document(done: Calibrated, in_use: StoredRig | None) -> dict[str, Any]:
     from calib.adjust.result import HELD_FIXED
     from mastctl.as_json import as_json
     from mastctl.calibration.landing import pointing_change
-    from mastctl.calibration.run import findings_as_json, fit_document, picked
+    from mastctl.calibration.run import findings_as_json, mast_document, picked
 
     fit = done.calibration
-    document = fit_document(done.survey, fit, done.verdict, done.saved)
+    document = mast_document(done.saved)
     document["mast_file"]["previous"] = None if done.previous is None else str(done.previous)
     document |= {
-        **picked(fit, "method", "mast_parameters"),
+        **picked(fit, "seconds", "chi2_probability", "notes"),
         "survey_digest": done.survey.digest,
         "wider_models": findings_as_json(fit.wider),
         "cross_validation": findings_as_json(fit.contradictions),
@@ -349,8 +349,7 @@ def _driven(args: argparse.Namespace, client: Client) -> Answer:
     """Have the daemon carry a run out, and bring its mast file and report here."""
     from calib.files.mast_file import load_rig
     from calib.targets.board_file import load_board
-    from mastctl.as_json import as_json
-    from mastctl.calibration.run import picked, save_new
+    from mastctl.calibration.run import mast_document, save_new
     from mastctl.client import ClientError
 
     began_s = time.monotonic()
@@ -383,20 +382,13 @@ def _driven(args: argparse.Namespace, client: Client) -> Answer:
         args.report.mkdir(parents=True, exist_ok=True)
         page = args.report / "bench.html"
         page.write_bytes(client.report(run["report"]))
-    rig = saved.rig
-    fit = {key: value for key, value in rig.fit.items() if key not in ("covariance", "parameters")}
-    sigma = fit.get("sigma", {})
     document: dict[str, Any] = {
-        "terms": [], "gauges": [], **fit, **(run["result"] or {}),
-        "mast": as_json(picked(rig.mast, "translation_m", "rotation_rad", "axis_offset_m", "axis_twist_rad")),
-        "sigma": {**sigma.get("mast", {}), **sigma},
+        "terms": [], "gauges": [], **mast_document(saved), **(run["result"] or {}),
         "seconds": time.monotonic() - began_s,
-        "mast_file": {
-            "path": str(saved.path), "digest": saved.digest, "previous": previous and str(previous)
-        },
         "survey": {"folder": str(Path(kept["folder"], name))},
         "report": None if page is None else str(page),
     }  # fmt: skip
+    document["mast_file"]["previous"] = previous and str(previous)
     return Answer(document, _bench_shown(document))
 
 
