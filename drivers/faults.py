@@ -229,7 +229,7 @@ class FaultPanel:
         """Have a function called whenever a fault was set or taken back."""
         self._listeners = (*self._listeners, changed)
 
-    def set(self, device: str, word: str, **parameters: Any) -> Fault:
+    def set(self, device: str, word: str, /, **parameters: Any) -> Fault:
         """Set a fault, in place of one with the same word on the same device.
 
         Raises BadOptions for an unknown device, word or parameter, or a value that is not a number within its

@@ -135,13 +135,6 @@ class AimedPixel(TypedDict):
     y_px: float
 
 
-class Refusal(TypedDict):
-    """Why the head would not be sent."""
-
-    code: str
-    message: str
-
-
 class Preview(TypedDict):
     """``POST /point/preview``: what a clicked pixel shows in a fresh frame, before anything moves.
 
@@ -169,7 +162,7 @@ class Preview(TypedDict):
     range_interval_m: list[float | None] | None
     aim: AimedPixel
     goal_rad: Angles | None
-    refused: Refusal | None
+    refused: ErrorAnswer | None
 
 
 class JogAnswer(TypedDict):

@@ -141,10 +141,9 @@ class Calls:
         """Hold a board up before a simulated rover, or move it; frames exposed from now on show it there.
 
         ``position_m`` (3,) is that of its middle in the rover frame as the rover truly stands; ``board`` has
-        the contents of its BOARD.yaml, by default those of the present board of this name. ``turned_rad``:
-        turns about its own x, y and z after facing the mast upright (the upper edge nearer, the right edge
-        nearer, clockwise), or ``quaternion``: rover_from_board (w, x, y, z). ``bow_m``: how far its middle
-        stands out, across and down; by default as before, flat at first.
+        the contents of its BOARD.yaml, by default those of the present board of this name. ``quaternion``:
+        rover_from_board (w, x, y, z), by default so that it faces the mast upright. ``bow_m``: how far its
+        middle stands out, across and down; by default as before, flat at first.
         """
         body = given(position_m=position_m, board=board, **more)
         return self.daemon.command(answers.BoardPose, "POST", f"/simulation/boards/{escaped(name)}", body)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from functools import cache
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Request
@@ -56,7 +55,6 @@ class JsonAnswer(JSONResponse):
     """JSON; what it has no place for (no finite number, a name that is no UTF-8) as `as_json` has it."""
 
     def render(self, content: Any) -> bytes:
-        """Return the bytes of an answer."""
         try:
             return super().render(content)
         except ValueError:
@@ -80,18 +78,6 @@ def marked(headers: Iterable[tuple[bytes, bytes]], policy: str, keep: str) -> He
     names = {name.lower() for name, _ in given}
     wanted = {**HEADERS, "content-security-policy": policy, "cache-control": keep}
     return given + [(n.encode(), v.encode()) for n, v in wanted.items() if n.encode() not in names]
-
-
-def sentences(errors: Sequence[Any], kind: Any, part: str) -> list[str]:
-    """Return pydantic's errors in the body or the query, a value of a kind, as sentences."""
-    whole = not errors[0]["loc"] and errors[0]["type"] != "value_error"
-    found = mistakes_in(errors, _schema_of(kind), f"the {part}" if whole else "")
-    return [f"{place[:120]}: {reason}" if place else reason for place, reason in found]
-
-
-@cache
-def _schema_of(kind: Any) -> dict[str, Any]:
-    return schema_of(kind, "")
 
 
 STATUS_OF_KIND: Mapping[type[Exception], int] = {
@@ -171,7 +157,10 @@ def _sentences(line: HTTPConnection, errors: Sequence[Any]) -> list[str]:
     dependant = line.scope["route"].dependant
     if part in ("body", "query"):
         params = dependant.body_params if part == "body" else dependant.query_params
-        return sentences(inside, params[0].field_info.annotation, part)
+        whole = not inside[0]["loc"] and inside[0]["type"] != "value_error"
+        schema = schema_of(params[0].field_info.annotation, "")
+        found = mistakes_in(inside, schema, f"the {part}" if whole else "")
+        return [f"{place[:120]}: {reason}" if place else reason for place, reason in found]
     known = {
         one.alias: one.field_info
         for each in (dependant, *dependant.dependencies)

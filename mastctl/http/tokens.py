@@ -11,10 +11,9 @@ import fcntl
 import hashlib
 import hmac
 import logging
-import os
 import secrets
 import stat
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
@@ -88,65 +87,59 @@ class TokenList:
 
     def first_run(self) -> tuple[Token, ...]:
         """Return the tokens, after making one for each role if there is no list yet. Raises BadFile."""
-        with self._locked():
-            tokens = self.read()
+        with self._locked() as tokens:
             if tokens is not None:
                 return tokens
             made = []
             for role in ROLES:
                 text, token = _new_token(role, role)
-                path = self.file_of(role)
-                try:
-                    replace_bytes(path, f"{text}\n".encode(), 0o600)
-                except OSError as error:
-                    raise BadFile(path, "", f"cannot be saved: {error.strerror or error}") from None
+                replace_bytes(self.file_of(role), f"{text}\n".encode(), 0o600)
                 made.append(token)
-            self._write(made)
-            return tuple(made)
+            return self._write(made)
 
     def new(self, name: str, role: Role) -> str:
         """Make a token and return it; it is kept nowhere else. Raises TokenRefused, BadFile."""
         if not name or len(name) > LONGEST_NAME or not all(c.isalnum() or c in "._-" for c in name):
             expected = f"1 to {LONGEST_NAME} letters, digits, dots, dashes are expected"
             raise TokenRefused(f"'{name[:60]}' where {expected}")
-        with self._locked():
-            tokens = self.read() or ()
-            if any(one.name == name for one in tokens):
+        with self._locked() as tokens:
+            if any(one.name == name for one in tokens or ()):
                 raise TokenRefused(f"there is a token '{name}' already; revoke it first")
-            if len(tokens) >= MOST_TOKENS:
+            if len(tokens or ()) >= MOST_TOKENS:
                 raise TokenRefused(f"there are {MOST_TOKENS} tokens; revoke one first")
             text, token = _new_token(name, role)
-            self._write([*tokens, token])
+            self._write([*(tokens or ()), token])
             return text
 
     def revoke(self, name: str) -> Token:
         """Revoke a token; it is valid no longer. Raises TokenRefused, BadFile."""
-        with self._locked():
-            tokens = self.read() or ()
-            found = next((one for one in tokens if one.name == name), None)
-            if found is None:
-                known = ", ".join(one.name for one in tokens) or "none"
+        with self._locked() as tokens:
+            by_name = {one.name: one for one in tokens or ()}
+            if name not in by_name:
+                known = ", ".join(by_name) or "none"
                 raise TokenRefused(f"there is no token '{name[:60]}'; there are: {known}")
-            self._write([one for one in tokens if one is not found])
+            found = by_name.pop(name)
+            self._write(by_name.values())
             if name in ROLES:
                 remove(self.file_of(found.role))
             return found
 
-    def _write(self, tokens: Sequence[Token]) -> None:
-        self._file.write({"tokens": [one.model_dump() for one in tokens]})
+    def _write(self, tokens: Iterable[Token]) -> tuple[Token, ...]:
+        kept = tuple(tokens)
+        self._file.write({"tokens": [one.model_dump() for one in kept]})
+        return kept
 
     @contextlib.contextmanager
-    def _locked(self) -> Iterator[None]:
-        """Keep a second command from changing the list meanwhile."""
+    def _locked(self) -> Iterator[tuple[Token, ...] | None]:
+        """Yield the tokens while no second command changes the list."""
+        lock = self.folder / "tokens.lock"
         try:
-            lock = os.open(self.folder / "tokens.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+            lock.touch(0o600)
+            with lock.open() as file:
+                fcntl.flock(file, fcntl.LOCK_EX)
+                yield self.read()
         except OSError as error:
             raise BadFile(self.folder, "", f"no tokens can be kept here: {error.strerror or error}") from None
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            yield
-        finally:
-            os.close(lock)
 
 
 class Access:
@@ -159,7 +152,7 @@ class Access:
         self._list = tokens
         self._tokens = tokens.first_run()
         self._temporary: tuple[Token, ...] = ()
-        self._seen = self._stamp()
+        self._problem = ""
 
     @property
     def folder(self) -> str:
@@ -167,18 +160,13 @@ class Access:
         return str(self._list.folder)
 
     def token_of(self, text: str) -> Token:
-        """Return the token of a text. Raises NotLetIn ``wrong_token``."""
-        found = self.known(text)
-        if found is None:
-            raise NotLetIn("wrong_token", "the token is unknown; perhaps it was revoked")
-        return found
-
-    def known(self, text: str) -> Token | None:
-        """Return the token of a text, None for another text; takes the same time for both."""
+        """Return the token of a text; takes the same time for any other. Raises NotLetIn ``wrong_token``."""
         digest, found = _digest_of(text), None
         for token in (*self._tokens, *self._temporary):
             if hmac.compare_digest(token.sha256, digest):
                 found = token
+        if found is None:
+            raise NotLetIn("wrong_token", "the token is unknown; perhaps it was revoked")
         return found
 
     def is_valid(self, digest: str) -> bool:
@@ -199,29 +187,19 @@ class Access:
         return text, revoke
 
     def reread(self) -> None:
-        """Read the list again if it has changed; a damaged one changes nothing."""
-        stamp = self._stamp()
-        if stamp == self._seen:
-            return
-        self._seen = stamp
+        """Read the list again; a damaged one changes nothing."""
+        problem, tokens = "", None
         try:
             tokens = self._list.read()
+            problem = f"{self._list.path} is gone" if tokens is None else ""
         except BadFile as error:
-            log.error("the tokens stay as they were: %s", error)
-            return
-        if tokens is None:
-            log.error("the tokens stay as they were: %s is gone", self._list.path)
-            return
-        self._tokens = tokens
-        log.info("%d tokens: %s", len(tokens), ", ".join(one.name for one in tokens) or "none")
-
-    def _stamp(self) -> tuple[int, int, int] | None:
-        """A value that changes with the list."""
-        try:
-            found = self._list.path.stat()
-        except OSError:
-            return None
-        return found.st_mtime_ns, found.st_size, found.st_ino
+            problem = str(error)
+        if problem and problem != self._problem:
+            log.error("the tokens stay as they were: %s", problem)
+        self._problem = problem
+        if tokens is not None and tokens != self._tokens:
+            self._tokens = tokens
+            log.info("%d tokens: %s", len(tokens), ", ".join(one.name for one in tokens) or "none")
 
 
 def _digest_of(token: str) -> str:

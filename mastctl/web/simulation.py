@@ -10,10 +10,9 @@ from fastapi import FastAPI, Path, Query
 from pydantic import Field, model_validator
 
 from calib.errors import BadFile
-from calib.geometry.rigid import FloatArray, Rigid, quaternion_of, rotation_of
+from calib.geometry.rigid import Rigid, quaternion_of, rotation_of
 from calib.targets.board_file import board_of, document_of
 from drivers.faults import BOUNDS, WHEN, FaultPanel, Word
-from drivers.faults import Fault as SetFault
 from drivers.simulation_clock import MAX, SimulationClock
 from mastctl import answers
 from mastctl.as_json import as_json
@@ -57,21 +56,17 @@ class BoardBody(StrictBody):
 
     ``board`` holds what a BOARD.yaml does (its ``schema`` may be left out); without it a board of this name
     is moved that is there already. The place is in the rover frame as the rover stands now. Without
-    ``quaternion`` (w, x, y, z; rover_from_board) it faces the mast upright and is then turned about its own
-    x, y and z.
+    ``quaternion`` (w, x, y, z; rover_from_board) it faces the mast upright.
     """
 
     position_m: Place
     board: dict[str, Any] | None = None
-    turned_rad: Annotated[list[Angle], Field(min_length=3, max_length=3)] | None = None
     quaternion: Annotated[list[Turn], Field(min_length=4, max_length=4)] | None = None
     bow_m: Annotated[list[Metres], Field(min_length=2, max_length=2)] | None = None
 
     @model_validator(mode="after")
-    def _one_turn(self) -> BoardBody:
-        if self.turned_rad is not None and self.quaternion is not None:
-            raise ValueError("quaternion and turned_rad are both there, one of them is expected")
-        if self.quaternion is not None and float(np.linalg.norm(self.quaternion)) < 1e-6:
+    def _turned(self) -> Self:
+        if self.quaternion is not None and math.hypot(*self.quaternion) < 1e-6:
             raise ValueError(f"quaternion: {self.quaternion} where one that is not zero is expected")
         return self
 
@@ -83,18 +78,11 @@ class TimeBody(StrictBody):
 
 
 class FaultBody(StrictBody):
-    """``POST /simulation/faults``: a fault word for a simulated device, with its parameters."""
+    """``POST /simulation/faults``: a fault of a simulated device, with its parameters."""
 
     device: Name
     word: Name
     parameters: dict[str, float] = Field(default_factory=dict)
-
-    @model_validator(mode="after")
-    def _free_names(self) -> FaultBody:
-        for name in ("device", "word", "self"):
-            if name in self.parameters:
-                raise ValueError(f"parameters.{name}: unknown key; no fault has a parameter of this name")
-        return self
 
 
 class TruthQuery(StrictQuery):
@@ -109,22 +97,9 @@ class TruthQuery(StrictQuery):
 
     @model_validator(mode="after")
     def _one(self) -> Self:
-        given = {name for name in ("x_px", "y_px", "x_m", "y_m", "z_m") if getattr(self, name) is not None}
-        if given not in ({"x_px", "y_px"}, {"x_m", "y_m", "z_m"}):
+        if self.model_fields_set - {"frame_id"} not in ({"x_px", "y_px"}, {"x_m", "y_m", "z_m"}):
             raise ValueError("x_px and y_px, or x_m, y_m and z_m, are expected, and not both")
         return self
-
-    @property
-    def pixel_px(self) -> tuple[float, float] | None:
-        """The pixel, None where a point was given."""
-        return None if self.x_px is None or self.y_px is None else (self.x_px, self.y_px)
-
-    @property
-    def position_in_site_m(self) -> tuple[float, float, float] | None:
-        """The point, None where a pixel was given."""
-        if self.x_m is None or self.y_m is None or self.z_m is None:
-            return None
-        return self.x_m, self.y_m, self.z_m
 
 
 class FaultsQuery(StrictQuery):
@@ -166,7 +141,6 @@ def add_simulation(app: FastAPI) -> None:
             name,
             printed,
             body.position_m,
-            turned_rad=body.turned_rad or (0.0, 0.0, 0.0),
             rotation=None if body.quaternion is None else rotation_of(body.quaternion),
             bow_m=(body.bow_m[0], body.bow_m[1]) if body.bow_m is not None else None,
         )
@@ -202,7 +176,8 @@ def add_simulation(app: FastAPI) -> None:
 
     @app.get(f"{PREFIX}/simulation/words", summary="The fault words of each device, with their parameters")
     async def words(here: Here) -> answers.FaultKinds:
-        return await here.waiting.run(lambda: {"devices": _words(_panel(here.service))})
+        known = _panel(here.service).words.items()
+        return {"devices": {device: {name: _kind(kinds[name]) for name in kinds} for device, kinds in known}}
 
     @app.get(f"{PREFIX}/simulation/faults", summary="The faults that are switched on")
     async def faults(here: Here) -> answers.FaultsSet:
@@ -257,54 +232,41 @@ def _time(service: Service) -> answers.SimulationTime:
 
 
 def _truth(service: Service, query: TruthQuery) -> answers.PointTruth:
-    """The truth requested. Raises NoLonger and as `FrameStore.by_id`."""
+    """The truth requested. Raises NoLonger and as `frame_by_id`."""
     rover = _rover(service, "truths")
     frame = service.devices.store.by_id(query.frame_id)
     try:
         site_from_rover = rover.frame_truth(frame.camera, frame.sequence).site_from_rover
-        if query.pixel_px is not None:
-            point = rover.true_point(frame.camera, frame.sequence, query.pixel_px)
-            return _truth_of(site_from_rover, point, query.pixel_px)
-        point = site_from_rover.inverse.points(np.array(query.position_in_site_m))
-        return _truth_of(site_from_rover, point, rover.true_pixel(frame.camera, frame.sequence, point))
+        if query.x_px is not None:
+            pixel = np.array([query.x_px, query.y_px])
+            point = rover.true_point(frame.camera, frame.sequence, pixel)
+            if point is None:  # the sky
+                return {"position_in_site_m": None, "position_m": None, "pixel_px": None}
+        else:
+            point = site_from_rover.inverse.points(np.array([query.x_m, query.y_m, query.z_m]))
+            pixel = np.asarray(rover.true_pixel(frame.camera, frame.sequence, point))
     except LookupError as error:
         raise NoLonger("frame_too_old", str(error.args[0])) from None
-
-
-def _truth_of(site_from_rover: Rigid, point_m: FloatArray | None, pixel_px: Any) -> answers.PointTruth:
-    """A point of the rover frame and its pixel as JSON; without a point nothing is known."""
-    if point_m is None:
-        return {"position_in_site_m": None, "position_m": None, "pixel_px": None}
-    pixel = np.asarray(pixel_px, dtype=np.float64)
     return {
-        "position_in_site_m": site_from_rover.points(point_m).tolist(),
-        "position_m": point_m.tolist(),
+        "position_in_site_m": site_from_rover.points(point).tolist(),
+        "position_m": point.tolist(),
         "pixel_px": pixel.tolist() if np.isfinite(pixel).all() else None,
     }
 
 
-def _words(panel: FaultPanel) -> dict[str, dict[str, answers.FaultKind]]:
-    """The fault words of each device; what has no end is null."""
-
-    def parameter(name: str, usual: float) -> answers.FaultParameter:
-        least, most = BOUNDS[name]
-        return {"default": as_json(usual), "least": least, "most": as_json(most)}
-
-    def word(one: Word) -> answers.FaultKind:
-        parameters = {**one.parameters, **WHEN}
-        return {
-            "effect": one.does,
-            "parameters": {name: parameter(name, parameters[name]) for name in parameters},
-        }
-
-    return {device: {name: word(one) for name, one in words.items()} for device, words in panel.words.items()}
+def _kind(one: Word) -> answers.FaultKind:
+    """A fault that can be set; a bound that is not there is null."""
+    parameters: dict[str, answers.FaultParameter] = {
+        name: {"default": as_json(usual), "least": BOUNDS[name][0], "most": as_json(BOUNDS[name][1])}
+        for name, usual in {**one.parameters, **WHEN}.items()
+    }
+    return {"effect": one.does, "parameters": parameters}
 
 
 def _faults(panel: FaultPanel) -> answers.FaultsSet:
-    return {"faults": [_fault(one) for one in panel.active()]}
-
-
-def _fault(fault: SetFault) -> answers.FaultSet:
-    """A set fault; one without an end has ``end_s`` null."""
-    finite = {name: value for name, value in fault.parameters.items() if math.isfinite(value)}
-    return cast(answers.FaultSet, as_json(fault) | {"parameters": finite})
+    """The faults that are set; one without an end has ``end_s`` null."""
+    faults = []
+    for one in panel.active():
+        finite = {name: value for name, value in one.parameters.items() if math.isfinite(value)}
+        faults.append(cast(answers.FaultSet, as_json(one) | {"parameters": finite}))
+    return {"faults": faults}
