@@ -1,7 +1,7 @@
 """Measure a daemon in a process of its own: start and stops.
 
     .venv/bin/python -m tools.benchmarks.daemon start [--rounds 10]
-    .venv/bin/python -m tools.benchmarks.daemon stop [--head memory|dynamixel|ptu] [--stops 100]
+    .venv/bin/python -m tools.benchmarks.daemon stop [--head memory|dynamixel|ptu] [--stops 100] [--crowd]
 
 ``start``: import, start until the first answer, and end; medians, in turn. The daemon has a simulated head
 and no camera.
@@ -9,7 +9,8 @@ and no camera.
 ``stop``: the head is under way each time, four clients take ten images a second each, one client has stalled,
 and no program reads the log. Stops arrive over HTTP, by a new connection each, and over the stop socket. An
 emergency stop's answer says that the latch is on the disk. The last column is from the answer to the
-operation's end.
+operation's end. With ``--crowd`` there are also 60 clients that take a picture a second, 60 that listen to
+events for a second and connect again, 30 that read the description each second, and 150 that read nothing.
 """
 
 from __future__ import annotations
@@ -54,19 +55,41 @@ while True:
 """
 
 
+CROWD = """
+import asyncio, sys
+async def ask(path, reads):
+    while True:
+        try:
+            reader, writer = await asyncio.open_connection("127.0.0.1", int(sys.argv[1]))
+            request_bytes = f"GET {path} HTTP/1.1\\r\\nHost: 127.0.0.1\\r\\n\\r\\n".encode()
+            writer.write(request_bytes * (1 if reads else 20))
+            await asyncio.wait_for(reader.read(), 1.0) if reads else await asyncio.sleep(3600.0)
+        except (OSError, TimeoutError, asyncio.TimeoutError):
+            pass
+        writer.close()
+async def main():
+    snapshot = f"/api/v1/snapshot/{sys.argv[2]}?fresh=false"
+    events, description = "/api/v1/events", "/openapi.json"
+    rows = (60, snapshot, True), (60, events, True), (30, description, True), (150, snapshot, False)
+    await asyncio.gather(*(ask(path, reads) for count, path, reads in rows for _ in range(count)))
+asyncio.run(main())
+"""
+
+
 def main() -> int:
     """Measure and print a table."""
     parser = options(__doc__, seed=None, tasks=False)
     parser.add_argument("what", choices=("start", "stop"))
     parser.add_argument("--head", choices=HEADS, help="stop: one of them (default: all)")
     parser.add_argument("--stops", type=at_least(1), default=100, metavar="N", help="of each kind (100)")
+    parser.add_argument("--crowd", action="store_true", help="stop: beside 300 clients more")
     parser.add_argument("--rounds", type=at_least(1), metavar="N", default=10, help="of start (10)")
     args = parser.parse_args()
     if args.what == "start":
         start(args.rounds)
     else:
         for head in [args.head] if args.head else HEADS:
-            stops_under_way(head, args.stops)
+            stops_under_way(head, args.stops, args.crowd)
     return 0
 
 
@@ -101,14 +124,14 @@ def start(rounds: int) -> None:
 LIBRARIES = "import numpy, scipy.optimize, scipy.spatial, cv2, fastapi, uvicorn, httpx, websockets, yaml"
 
 
-def stops_under_way(head: str, stops: int) -> None:
+def stops_under_way(head: str, stops: int, crowd: bool) -> None:
     """Print how soon stops of a moving head are answered, and how soon the operation ends."""
     columns = ("head", "request", "answered, ms: median", "90 %", "99 %", "longest", "within 20 ms, %")
     print(heading((*columns, "ended: 99 %")))
     with (
         tempfile.TemporaryDirectory() as folder,
         _daemon(Path(folder), head) as (port, path),
-        _streams(port),
+        _streams(port, crowd),
         Client(f"http://127.0.0.1:{port}") as client,
     ):
         for name, stop in _requests(client.url, path).items():
@@ -178,11 +201,11 @@ def _daemon(folder: Path, head: str) -> Iterator[tuple[int, Path]]:
 
 
 @contextlib.contextmanager
-def _streams(port: int) -> Iterator[None]:
-    """Clients that stream pictures, and one that asks for many and reads none."""
+def _streams(port: int, crowd: bool) -> Iterator[None]:
+    """Clients that stream pictures, perhaps a crowd, and one that requests many and reads none."""
     streams = [
-        subprocess.Popen([sys.executable, "-c", STREAM, str(port), CAMERA], stderr=subprocess.DEVNULL)
-        for _ in range(STREAMS)
+        subprocess.Popen([sys.executable, "-c", script, str(port), CAMERA], stderr=subprocess.DEVNULL)
+        for script in [STREAM] * STREAMS + [CROWD] * crowd
     ]
     stalled = socket.create_connection(("127.0.0.1", port))
     stalled.setblocking(False)
