@@ -103,19 +103,17 @@ class StopCame:
 
 @dataclass(frozen=True)
 class Lease:
-    """The right to steer until ``until_s``, seconds of the lease's clock.
+    """The right to steer until ``until_s``, seconds of the lease's clock; it ends with its caller's token.
 
     ``last_stop`` is that of `LeaseTable.last_stop` after which the next one ends it; None: no stop does.
-    ``credential`` is the digest of its caller's token, with which it ends; empty: none.
     """
 
     id: str
     holder: str
+    caller: Caller
     for_s: float
     until_s: float
     last_stop: StopCame | None = None
-    credential: str = field(default="", repr=False)
-    caller: str = ""
 
 
 class LeaseTable:
@@ -148,7 +146,7 @@ class LeaseTable:
         self._closing = threading.Event()
 
     def control(self) -> ControlAnswer | None:
-        """Return the client that steers now as ``GET /status`` has it; takes no lock."""
+        """Return the client that steers now; takes no lock."""
         lease = self._lease
         if lease is not None and not self._over_by(lease):
             return {"kind": "lease", **self.lease_as_json(lease)}
@@ -157,7 +155,7 @@ class LeaseTable:
         return None if party is None else {"holder": party, "kind": "operation", "for_s": None, "until": None}
 
     def lease_as_json(self, lease: Lease) -> LeaseRuns:
-        """Return a lease as its holder gets it: what is left of it, and its end by the wall clock (UTC)."""
+        """Return what is left of a lease, seconds, and its end by the wall clock (UTC)."""
         left_s = max(0.0, lease.until_s - self._clock.now_s())
         until = datetime.now(UTC) + timedelta(seconds=left_s)
         return {"holder": lease.holder, "for_s": left_s, "until": until.isoformat()}
@@ -203,10 +201,7 @@ class LeaseTable:
                 pause_s = AGAIN_S
 
     def stop_left_running(self) -> None:
-        """Stop what runs without its lease, if anything; again at the next call until the head confirms it.
-
-        A command that was carried out meanwhile takes over. Raises what the stop raises.
-        """
+        """Stop what runs without its lease, if anything; at each call until the head confirms it."""
         with self._changing():
             why = self._left
         if why:
@@ -226,7 +221,7 @@ class LeaseTable:
     def renew(self, lease_id: str, for_s: float | None = None) -> Lease:
         """Have a lease run for ``for_s`` seconds from now on, by default as long as at first; return it.
 
-        Raises NotNow ``lease_over`` with how it ended, ``lease_unknown``.
+        Raises LeaseOver; NotNow ``lease_unknown``.
         """
         with self._changing():
             lease = self._running_lease(lease_id)
@@ -267,7 +262,7 @@ class LeaseTable:
         """Let a command that steers be carried out inside the block; waits for nothing.
 
         Until it has ended, and what it started too, no other client gets a lease or steers, unless by `take`.
-        Raises Leased; NotNow ``lease_over``, ``lease_unknown``, for the lease that came with it.
+        Raises Leased, and as `renew` for the lease that came with it.
         """
         ticket = object()
         lease: Lease | None = None
@@ -316,7 +311,8 @@ class LeaseTable:
             return f"the lease was not renewed for {lease.for_s:g} s"
         if self.was_stopped(lease):
             return self._last_stop.how
-        if lease.credential and not self.token_is_valid(lease.credential):
+        credential = lease.caller.credential
+        if credential and not self.token_is_valid(credential):
             return "the token that it was granted to has ended"
         return ""
 
@@ -338,10 +334,8 @@ class LeaseTable:
 
     def _grant(self, caller: Caller, name: str | None, for_s: float, last_stop: StopCame | None) -> Lease:
         until_s = self._clock.now_s() + for_s
-        holder, proof = name or caller.name, caller.credential
-        lease = Lease(secrets.token_hex(16), holder, for_s, until_s, last_stop, proof, caller.name)
-        self._lease = lease
-        return lease
+        self._lease = Lease(secrets.token_hex(16), name or caller.name, caller, for_s, until_s, last_stop)
+        return self._lease
 
     def _end(self, how: str) -> None:
         lease = self._lease
@@ -351,7 +345,7 @@ class LeaseTable:
         while len(self._over) > REMEMBERED:
             del self._over[next(iter(self._over))]
         self._lease = None
-        if self._party in (lease.holder, lease.caller) and not self.was_stopped(lease):
+        if self._party in (lease.holder, lease.caller.name) and not self.was_stopped(lease):
             self._leave_running(lease, how)
 
     def _leave_running(self, lease: Lease, how: str) -> None:

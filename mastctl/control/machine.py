@@ -189,7 +189,7 @@ class Standing:
         return {**self.summary(now_s), "track": self.track, "moving": bool(self.head_moves)}
 
     def summary(self, now_s: float) -> StateFacts:
-        """Return it as JSON at a moment, without the track and whether the head moves."""
+        """Return the same without the track and whether the head moves."""
         state, reason = self._judged()
         return {
             "state": state,
@@ -249,14 +249,11 @@ class StateMachine:
         self._change(lambda now: replace(now, operation=None, residual=residual or now.residual))
 
     def follow(self, track: str | None) -> None:
-        """Note which track is active, by the id of the operation that began it.
-
-        Nothing is refused: its operation was begun, and a stop in between ends the track too.
-        """
+        """Note which track is active, by the id of the operation that began it; a stop ends it too."""
         self._change(lambda now: replace(now, track=track, dropped="" if track else now.dropped))
 
     def head_read(self, moving: bool) -> None:
-        """Note what a reading of the head says; nothing is done if the one before said the same."""
+        """Note whether the head moves."""
         if self._standing.head_moves is not moving:
             self._change(lambda now: replace(now, head_moves=moving, coasts=now.coasts and moving))
 
@@ -273,24 +270,21 @@ class StateMachine:
 
     def stop_requested(self) -> None:
         """Note that a stop was requested; `stop_ended` follows when it is over."""
-        self._change(
-            lambda now: replace(
-                now,
-                stops=now.stops + 1,
-                stopping=now.stopping or not now.latched,
-                coasts=bool(now.head_moves),
-                dropped=AFTER_A_STOP,
-            )
-        )
+
+        def change(now: Standing) -> Standing:
+            stopping, coasts = now.stopping or not now.latched, bool(now.head_moves)
+            return replace(now, stops=now.stops + 1, stopping=stopping, coasts=coasts, dropped=AFTER_A_STOP)
+
+        self._change(change)
 
     def stop_ended(self) -> None:
         """Note that a stop is over: the head has confirmed it, or its fault was reported before."""
         self._change(lambda now: replace(now, stops=max(0, now.stops - 1)))
 
     def estop_requested(self, latched: Callable[[], Sequence[Latched]]) -> None:
-        """Note an emergency stop, between `stop_requested` and `stop_ended` of its stop.
+        """Note an emergency stop: from then on nothing may begin.
 
-        From then on nothing may begin. ``latched`` returns all causes of then; it must not wait.
+        ``latched`` returns all causes of then, without waiting.
         """
         self._change(lambda now: replace(now, latched=tuple(latched()), dropped=AFTER_A_STOP))
 

@@ -101,7 +101,7 @@ def _last_pointing(result: Any) -> Mapping[str, Any]:
 
 
 class Mover(Protocol):
-    """What of `mastctl.devices.devices.Devices` is needed to stop and to keep stopped."""
+    """The part of `mastctl.devices.devices.Devices` that stops, and keeps stopped."""
 
     def stop(self) -> None: ...
     def block_moves(self, holder: object, reason: str) -> None: ...
@@ -165,11 +165,10 @@ class OperationRunner:
         return self._machine.standing.operation
 
     def start(self, request: Mapping[str, Any], work: Work, on_end: OnEnd | None = None) -> Operation:
-        """Start ``work(record_step, cancelled)`` in a thread and return its first record.
+        """Start ``work(record_step, cancelled)`` in a thread and return its first record; waits for nothing.
 
         ``on_end`` gets the last record, in the same thread, when the next operation may be started already.
-        Waits for nothing: `let_stopped_end` does, before any lock is taken. Raises as `Standing.refusal`
-        of ``motion``; Unable ``no_thread`` if the machine has none for it (the record says so too).
+        Raises the refusal of ``motion``; Unable ``no_thread`` if the machine has none for it.
         """
         with self._changed:
             name = f"{next(self._numbers):06d}-{self._run}"
@@ -237,15 +236,14 @@ class OperationRunner:
             self._stop_ended()
 
     def end(self, name: str, error: MastctlError | None = None) -> None:
-        """Do the same; what the head does not confirm is logged, and a fault of it."""
+        """Do the same; what the head does not confirm is logged."""
         with self._logged(f"when operation {name} was to end"):
             self.stop_one(name, error)
 
     def end_within(self, name: str, left_s: float, allowed_s: float) -> None:
-        """Stop the mast and end an operation with ``deadline_passed`` if it runs longer than ``left_s``.
+        """Stop the mast and end an operation that runs longer than ``left_s``, of ``allowed_s`` altogether.
 
-        ``allowed_s`` is how long altogether, for the message. A stop that comes before is the last word; the
-        first of several deadlines counts.
+        A stop that comes before is the last word; the first of several deadlines counts.
         """
         late = NotNow("deadline_passed", f"operation {name} did not end in the {allowed_s:g} s it was given")
         with self._changed:

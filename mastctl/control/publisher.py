@@ -24,14 +24,12 @@ import contextlib
 import itertools
 import threading
 from dataclasses import dataclass
-from typing import Any, Literal, Self, TypeVar, get_args
+from typing import Any, Literal, Self, get_args
 
 Topic = Literal[
     "state", "joints", "operation", "track", "fault", "frame", "mast", "command", "lease", "bench"
 ]
 TOPICS: frozenset[Topic] = frozenset(get_args(Topic))
-
-_Subscription = TypeVar("_Subscription", bound="Subscription")
 
 MOST_UNREAD = 10_000
 """Values that wait for one listener."""
@@ -66,10 +64,7 @@ class Subscription:
 
     def close(self) -> None:
         """Receive no more; a reader that waits is woken."""
-        with self._publisher.lock:
-            self._publisher.leave(self)
-            self.closed = True
-            self._wake()
+        self._publisher.leave(self)
 
     def __enter__(self) -> Self:
         return self
@@ -78,6 +73,11 @@ class Subscription:
         self.close()
 
     # For the publisher, which keeps its lock
+
+    def end(self) -> None:
+        """Have the reader know that no more will come."""
+        self.closed = True
+        self._wake()
 
     def put(self, one: Published) -> None:
         """Keep a value for the reader."""
@@ -135,10 +135,7 @@ class LoopSubscription(Subscription):
         self._something = asyncio.Event()
 
     async def wait(self, timeout_s: float | None = None) -> list[Published]:
-        """Return what is new since the last call, oldest first; wait for it for ``timeout_s`` seconds.
-
-        Empty if nothing came in that time, or `closed`. None waits for as long as it takes.
-        """
+        """Do the same as a coroutine."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
                 while not (self._unread or self.closed):
@@ -166,10 +163,7 @@ class Publisher:
         self.lock = threading.RLock()
 
     def publish(self, topic: Topic, key: str, value: Any) -> None:
-        """Hand every listener of a topic the newest value of a key.
-
-        Values reach each listener in the order in which they were published.
-        """
+        """Hand every listener of a topic the newest value of a key, in the order of publication."""
         with self.lock:
             one = self._newest[topic, key] = Published(next(self._numbers), topic, key, value)
             for subscription in self._subscriptions:
@@ -188,15 +182,16 @@ class Publisher:
         return None if known is None else known.value
 
     def subscribe(self, *topics: Topic) -> ThreadSubscription:
-        """Return a subscription for a thread; without topics to all of them.
-
-        It begins with the newest value of each key that is known already.
-        """
-        return self._added(ThreadSubscription(self, topics))
+        """Return a subscription for a thread, without topics to all; it begins with what is known already."""
+        subscription = ThreadSubscription(self, topics)
+        self._add(subscription)
+        return subscription
 
     def subscribe_here(self, *topics: Topic, keys: frozenset[str] | None = None) -> LoopSubscription:
         """Return the same for a coroutine of the running event loop, of some keys only if they are given."""
-        return self._added(LoopSubscription(self, topics, keys))
+        subscription = LoopSubscription(self, topics, keys)
+        self._add(subscription)
+        return subscription
 
     @property
     def listeners(self) -> int:
@@ -208,19 +203,19 @@ class Publisher:
         with self.lock:
             self._closed = True
             for one in self._subscriptions:
-                one.close()
+                self.leave(one)
 
     def leave(self, subscription: Subscription) -> None:
-        """Drop a subscription."""
+        """End a subscription."""
         with self.lock:
             self._subscriptions = tuple(one for one in self._subscriptions if one is not subscription)
+            subscription.end()
 
-    def _added(self, subscription: _Subscription) -> _Subscription:
+    def _add(self, subscription: Subscription) -> None:
         with self.lock:
             if self._closed:
-                subscription.close()
-                return subscription
+                subscription.end()
+                return
             self._subscriptions = (*self._subscriptions, subscription)
             for one in sorted(self._newest.values(), key=lambda one: one.sequence):
                 subscription.put(one)
-        return subscription

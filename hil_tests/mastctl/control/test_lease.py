@@ -90,7 +90,7 @@ def test_the_holders_own_name_does_not_do_instead_of_its_lease(world: World) -> 
     lease = world.leases.acquire(BENCH)
     refused("leased", lambda: world.steer(BENCH))
     refused("leased", lambda: world.leases.acquire(BENCH))
-    refused("lease_unknown", lambda: world.steer(BENCH, Lease("0" * 32, "bench", 1, 2)))
+    refused("lease_unknown", lambda: world.steer(BENCH, Lease("0" * 32, "bench", BENCH, 1, 2)))
     world.steer(ROVER, lease)  # who has been given the id steers in the holder's name
 
 
@@ -212,7 +212,7 @@ def test_a_lease_ends_with_the_token_that_it_was_granted_to(world: World) -> Non
     for grant in (world.leases.acquire, lambda caller: world.leases.take(caller, "a test")):
         shown.add("of a token")
         lease = grant(Caller("bench", credential="of a token"))
-        assert world.leases.renew(lease.id).credential == "of a token"
+        assert world.leases.renew(lease.id).caller.credential == "of a token"
         shown.clear()
         assert world.leases.control() is None
         assert not world.leases.holds(lease.id)
