@@ -28,7 +28,7 @@ from drivers.hardware import DeviceSettings, HardwareSettings, is_hardware
 from drivers.registry import Kind
 from mastctl.devices.judge import LEAST_CONE_RAD, SUN, WIDEST_CONE_RAD, Limits, SunDirection, direction_of
 from mastctl.devices.keep_out import Box
-from mastctl.motion.settings import TrackingSettings
+from mastctl.motion.pairs import TrackingSettings
 from mastctl.packaged import default_config
 from mastctl.recorder.folder import RecordSettings
 

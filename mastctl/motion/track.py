@@ -28,9 +28,9 @@ from mastctl.control.operations import Operation, OperationRunner
 from mastctl.devices.devices import Devices
 from mastctl.devices.judge import Limits
 from mastctl.errors import BadRequest, MastctlError, NotNow
+from mastctl.motion.pairs import TrackingSettings
 from mastctl.motion.requests import TrackRequest
 from mastctl.motion.search import TargetSearch, TrackSighting
-from mastctl.motion.settings import TrackingSettings
 
 log = logging.getLogger(__name__)
 

@@ -17,7 +17,7 @@ from mastctl.answers import HeadPlace, KeptTarget
 from mastctl.control.operations import OperationRunner
 from mastctl.devices.frames import StampedFrame
 from mastctl.errors import BadRequest, NotKnown, NotNow, Unable
-from mastctl.motion.search import in_picture
+from mastctl.motion.pairs import in_picture
 from mastctl.motion.track import ACTIVE, Tracker
 from mastctl.safety.state_folder import StateFile
 from mastctl.service.masts import Masts

@@ -30,7 +30,7 @@ from drivers.sim.placed import SceneSettings
 from drivers.sim.scene import build_scene
 from mastctl.cli.experiment import results_of
 from mastctl.experiment.targets import texture_mask
-from mastctl.motion.search import choose_pairs
+from mastctl.motion.pairs import choose_pairs
 from mastctl.packaged import config_folder
 from tools.command import end, options, show
 from tools.studies.approach_world import ApproachWorld, WorldErrors
@@ -247,7 +247,7 @@ def _look(
     """Look for the target with the pair of its range, again if it is lost; the track and the record."""
     rig = world.believed
     chosen = choose_pairs(rig, track.position_m)[0]
-    name, pan, tilt = chosen.pair, chosen.pan_rad or 0.0, chosen.tilt_rad or 0.0
+    name, pan, tilt = chosen.pair, *(chosen.true_rad or (0.0, 0.0))
     pair = rig.stereo[name]
     doubted = False
     for _ in range(LOST_LOOKS):

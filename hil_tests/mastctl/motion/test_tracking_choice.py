@@ -16,8 +16,7 @@ from calib.geometry.pointing import choose
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid
 from mastctl.errors import MastctlError
-from mastctl.motion.search import choose_pairs
-from mastctl.motion.settings import HandoffRules, PairBounds
+from mastctl.motion.pairs import HandoffRules, PairBounds, choose_pairs
 from mastctl.motion.track import LATE_S, RoverPose, check_follows, is_still, motion_between
 
 
@@ -38,13 +37,11 @@ def test_the_papers_pair_looks_at_each_range(rig: Rig, range_m: float, pair: str
 
 @pytest.mark.parametrize("range_m", [9.0, 4.0, 2.0])
 def test_the_target_comes_midway_between_the_middles_of_both_pictures(rig: Rig, range_m: float) -> None:
-    turned = [choice for choice in choose_pairs(rig, ahead(range_m)) if choice.pan_rad is not None]
+    turned = [choice for choice in choose_pairs(rig, ahead(range_m)) if choice.true_rad is not None]
     assert {choice.pair for choice in turned} == {"pancam", "navcam"}
     for choice in turned:
-        assert choice.pan_rad is not None and choice.tilt_rad is not None
-        left, right = (
-            rig.camera_in_rover(eye, choice.pan_rad, choice.tilt_rad) for eye in rig.stereo[choice.pair]
-        )
+        assert choice.true_rad is not None
+        left, right = (rig.camera_in_rover(eye, *choice.true_rad) for eye in rig.stereo[choice.pair])
         off = [model.project(ahead(range_m))[0] - np.array(model.image_center_px) for model in (left, right)]
         assert np.abs(off[0] + off[1]).max() < 1.0
 

@@ -19,9 +19,9 @@ from drivers.errors import NoReply
 from hil_tests.mastctl.motion.pointing_world import LIMITS, SIZE_PX, World, rig
 from mastctl.answers import Step
 from mastctl.devices.frames import StampedFrame
+from mastctl.motion.pairs import TrackingSettings
 from mastctl.motion.requests import PixelTarget, PointingError
 from mastctl.motion.search import NotTrackable, TargetSearch
-from mastctl.motion.settings import TrackingSettings
 
 PIXEL = (110.0, 130.0)
 Paint = Callable[[str, int, np.ndarray], np.ndarray]
