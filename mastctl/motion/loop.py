@@ -83,20 +83,17 @@ class PointingLoop(Steps):
         """Carry out the request; blocks until it is done, at most the sum of its deadlines.
 
         ``view_rad``: true angles at which the clicked picture of a panorama was taken; the head goes there
-        first. Raises PointingError with the step and the pointings done before; the mast was stopped.
+        first. Raises PointingError with the step and the pointings done before; its caller stops the mast.
         """
         try:
             if view_rad is not None and request.pixel is not None:
                 self._return_to(view_rad, request.pixel.camera)
             self._run(request)
-        except BaseException as error:
-            self.stop_whatever_happened()
-            if isinstance(error, (MastctlError, DriverError, CalibError)):
-                code, message = getattr(error, "code", "failed"), " ".join(str(error).split())
-                if view_rad is not None and self.last == "target":
-                    message += CHANGED
-                raise PointingError(code, message, self.last, self._so_far()) from error
-            raise
+        except (MastctlError, DriverError, CalibError) as error:
+            code, message = getattr(error, "code", "failed"), " ".join(str(error).split())
+            if view_rad is not None and self.last == "target":
+                message += CHANGED
+            raise PointingError(code, message, self.last, self._so_far()) from error
         result = self._so_far()
         assert result is not None
         return result

@@ -110,12 +110,10 @@ class RigCameras:
         both cameras of another pair on the head serve, the clicked pair first. Empty if none sees it.
         """
         partner = self.partner(aiming)
-        if partner is not None and self._sees(partner, position_m, resting):
-            return (partner,)
         pairs = sorted(self._rig.stereo.values(), key=lambda pair: clicked not in pair)
-        for pair in pairs:
-            if aiming not in pair and all(self._sees(name, position_m, resting) for name in pair):
-                return pair
+        for names in ((partner,) if partner else (), *(pair for pair in pairs if aiming not in pair)):
+            if names and all(self._sees(name, position_m, resting) for name in names):
+                return names
         return ()
 
     def new(
@@ -123,8 +121,7 @@ class RigCameras:
     ) -> dict[str, CameraView]:
         """Return frames exposed after a moment, by a head that rests where it was read.
 
-        Raises PointingError ``head_moving`` if the head moved in an exposure or is not where it rested;
-        DriverError if a frame does not come, or cannot be used.
+        Raises PointingError ``head_moving`` if it moved; DriverError if a frame does not come.
         """
         views = {}
         timeout_s = FRAME_TIMEOUT_S if timeout_s is None else timeout_s
@@ -155,15 +152,11 @@ class RigCameras:
 
         None of a move that is smaller than what need not show, or that leaves too little in common.
         """
-        way_rad = max(abs(goal - start) for goal, start in zip(goal_rad, start_rad, strict=True))
-        if way_rad <= FLOOR_RAD:
+        if max(abs(goal - start) for goal, start in zip(goal_rad, start_rad, strict=True)) <= FLOOR_RAD:
             return []
-        wanted = [
-            name
-            for name in cameras
-            if name in self._devices.newest_frames() and self._on_head(name) and name not in self._before
-        ]
-        return [name for name in wanted if overlap(self._rig, name, start_rad, goal_rad) >= LEAST_OVERLAP]
+        known = self._devices.newest_frames()
+        wanted = [one for one in cameras if one in known and self._on_head(one) and one not in self._before]
+        return [one for one in wanted if overlap(self._rig, one, start_rad, goal_rad) >= LEAST_OVERLAP]
 
     def check_motion(self, views: Mapping[str, CameraView], detail: dict[str, Any]) -> None:
         """Compare new images of one moment with the last ones of the same cameras, and keep them instead.
@@ -174,11 +167,8 @@ class RigCameras:
         evidence = detail["motion_evidence"] = dict[str, dict[str, Any]]()
         refused: BadFrame | None = None
         for name, view in views.items():
-            if not self._on_head(name):
-                evidence[name] = {"verdict": "on_body"}
-                continue
             if name not in self._before:
-                evidence[name] = {"verdict": "no_picture_before"}
+                evidence[name] = {"verdict": "no_picture_before" if self._on_head(name) else "on_body"}
                 continue
             before, beside = self._before[name]
             after = _posed(view)
@@ -197,13 +187,9 @@ class RigCameras:
     ) -> dict[str, Any]:
         """Check that what a pixel shows moves by less than half a pixel between exposures of several cameras.
 
-        Where these were not at one moment, its speed is measured in a further image of the first camera, in
-        the image itself: the mast and the target count alike. That the head reports no motion is checked
-        before (`new`). Returns for the record ``dt_s`` by other camera, and ``image_speed_px_per_s``,
-        ``moved_px`` where measured.
-
-        Raises PointingError ``target_moving`` if it moves too far, or is not found where it was; DriverError
-        if the further image does not come.
+        Where these were not at one moment, its speed is measured in a further image of the first camera.
+        Returns for the record ``dt_s`` by other camera, and ``image_speed_px_per_s``, ``moved_px`` where
+        measured. Raises PointingError ``target_moving``; DriverError if the further image does not come.
         """
         detail = apart(view, others)
         moments_s = (0.0, *detail["dt_s"].values())
@@ -302,13 +288,11 @@ class RigCameras:
     def agree(
         self, clicked: Clicked, now: CameraView, seen: PatchMatch, other: CameraView, same_pair: bool
     ) -> tuple[PatchMatch, dict[str, Any]]:
-        """Find the clicked thing in the other camera too and check that both mean the same place.
+        """Find the clicked thing in the other camera too; return the match there, and facts for the record.
 
         One camera alone would accept a shifted image. Compared is the place in the other one with where the
-        first one's ray leads there; a wrong joint angle turns both alike and does not show. Returns the match
-        in the other camera, and the difference across and along the epipolar line.
-
-        Raises PointingError ``eyes_disagree`` if the other camera does not confirm the place.
+        first one's ray leads there; a wrong joint angle turns both alike and does not show. Raises
+        PointingError ``eyes_disagree``.
         """
         try:
             confirmed = self.find(clicked, other)

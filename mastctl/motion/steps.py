@@ -15,7 +15,6 @@ from calib.geometry.pointing import Solution, ordered
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from drivers.clock import Clock
-from drivers.interfaces import AxisReport
 from mastctl.answers import Step
 from mastctl.devices.devices import Devices
 from mastctl.devices.joint_history import DITHER_RAD, HeadReading, RestWatch
@@ -163,10 +162,7 @@ class Steps:
         return reading
 
     def resting(self) -> HeadReading:
-        """Return the reading of a head that rests now.
-
-        Raises PointingError ``head_moving`` if it still moves after ``rest_wait_s``; else as `read`.
-        """
+        """Return the reading of a head that rests now. Raises PointingError ``head_moving``; as `read`."""
         watch = RestWatch(0.0, DITHER_RAD)
         settled, last = self._rests(watch, self._clock.now_s() + REST_WAIT_S)
         if not settled:
@@ -210,10 +206,7 @@ class Steps:
         return goal, self.go(*goal)
 
     def go(self, pan_rad: float, tilt_rad: float) -> HeadReading:
-        """Check the limits, move until the head reads the angles, wait until settled; return the reading.
-
-        Raises OutsideLimits, KeptOut, PointingError, Stopped, DriverError.
-        """
+        """Check the limits, move until the head reads the angles, wait until settled; return the reading."""
         with self.step("limits") as detail:
             detail.update(pan_rad=pan_rad, tilt_rad=tilt_rad)
             self.check_goal(pan_rad, tilt_rad)
@@ -225,8 +218,6 @@ class Steps:
         with self.step("settle") as detail:
             settled = self.arrived(pan_rad, tilt_rad, began_s + allowed_s)
             detail.update(_angles(settled), count_rad=dict(self._devices.judge.counts_rad))
-            if reports := self._devices.reports:
-                detail.update(counts={name: _counts(axis) for name, axis in reports.items()})
         return settled
 
     def check_goal(self, pan_rad: float, tilt_rad: float) -> None:
@@ -241,7 +232,7 @@ class Steps:
         return distance / self._limits.speed_rad_per_s + DWELL_S + MOVE_MARGIN_S
 
     def send(self, pan_rad: float, tilt_rad: float) -> None:
-        """Start the move at the speed cap. Raises OutsideLimits, Stopped, DriverError."""
+        """Start the move at the speed cap."""
         self.check_not_stopped()
         self._goal = (pan_rad, tilt_rad)
         self._devices.move(pan_rad, tilt_rad)
@@ -283,10 +274,7 @@ class Steps:
     # The cameras
 
     def clicked(self, target: PixelTarget, alone: bool = False) -> FoundAgain:
-        """Take a fresh pair, or the clicked camera's image ``alone``, and find in it what was clicked.
-
-        Raises MastctlError, DriverError, as `clicked_frame` too.
-        """
+        """Take a fresh pair, or the clicked camera's image ``alone``, and find in it what was clicked."""
         view = self.cameras.view(clicked_frame(target, self._rig, self._devices.store.by_id))
         pixel = np.array([target.x_px, target.y_px])
         partner = None if alone else self.cameras.partner(target.camera)
@@ -312,8 +300,7 @@ class Steps:
     ) -> None:
         """Take images to compare with after a move, where there are none yet and they will show something.
 
-        ``goal_rad`` are the true angles that it leads to. A camera that gives none is left out, and named in
-        the record, unless it is ``needed``. Nothing has moved where it raises PointingError, DriverError.
+        ``goal_rad``: true angles that it leads to. A camera that gives none is left out unless ``needed``.
         """
         lacking = self.cameras.lacking(cameras, self.read().true_rad, goal_rad)
         if not lacking:
@@ -330,10 +317,7 @@ class Steps:
                 detail.update(missing=missing)
 
     def capture(self, cameras: Sequence[str], settled: HeadReading) -> dict[str, CameraView]:
-        """Take new images, exposed after the head had settled, that moved as the head did.
-
-        Raises PointingError, DriverError; `BadFrame` if one shows another view than the joints say.
-        """
+        """Take new images, exposed after the head had settled. Raises BadFrame if they did not move as it."""
         with self.step("look") as detail:
             views = self.cameras.new(cameras, settled.time_s, settled)
             first, *others = views.values()
@@ -341,12 +325,6 @@ class Steps:
             self.cameras.check_motion(views, detail)
             self.motion_evidence = detail["motion_evidence"]
         return views
-
-
-def _counts(axis: AxisReport) -> dict[str, Any]:
-    """Where an axis was sent and is in its own counts, and what is left between, for the record."""
-    left_rad = None if axis.left_rad is None else round(axis.left_rad, 7)
-    return {"goal_counts": axis.goal_counts, "measured_counts": axis.measured_counts, "left_rad": left_rad}
 
 
 def _outside(value: float, one: float, other: float) -> float:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from calib.geometry.rig import Mast, Rig, RigCamera
 from drivers.clock import ManualClock
-from drivers.interfaces import AxisReport, Reading
+from drivers.interfaces import Reading
 from hil_tests.calib.matching.textured_planes import Edge, Pinhole, TexturedPlane, picture, random_texture
 from mastctl.answers import PointingResult, Step
 from mastctl.devices.frames import StampedFrame
@@ -115,7 +115,6 @@ class World:
     late_s: dict[str, float] = field(default_factory=dict)
     moves: list[tuple[float, float]] = field(default_factory=list)
     stops: int = 0
-    reports: Mapping[str, AxisReport] = field(default_factory=dict)
     digest: str = "0" * 64
     scene: Callable[[], TexturedPlane | Edge] = ground
 
