@@ -140,21 +140,20 @@ class RecordFolder:
     def drop_oldest_segment(self) -> bool:
         """Let the ring's oldest segment go; False if there is none beside the newest."""
         segments = _files(self._ring)
-        if len(segments) < 2:
-            return False
-        segments[0].unlink(missing_ok=True)
-        return True
+        if len(segments) > 1:
+            segments[0].unlink(missing_ok=True)
+        return len(segments) > 1
 
-    def keep_ring(self, why: str, kept_mb: float) -> str:
+    def keep_ring(self, reason: str, kept_mb: float) -> str:
         """Move the ring's segments to a folder of their own and return its name, empty if there are none;
         the oldest kept ones go.
         """
-        if not _files(self._ring):
+        if not (segments := _files(self._ring)):
             return ""
         number = _next_number(self._kept.iterdir())
-        place = self._kept / f"{number:06d}-{_stamp()}{_suffix(why)}"
+        place = self._kept / f"{number:06d}-{_stamp()}{_suffix(reason)}"
         place.mkdir(mode=0o700)
-        for path in _files(self._ring):
+        for path in segments:
             path.rename(place / path.name)
         kept = [one for one in self.all() if one.kind == "kept"]
         while len(kept) > 1 and sum(one.size_bytes for one in kept) > kept_mb * MB:

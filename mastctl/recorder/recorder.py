@@ -23,7 +23,7 @@ from queue import SimpleQueue
 from typing import Any, TypeVar
 
 from drivers.clock import Clock
-from mastctl.answers import RecorderState, RecordingDeleted, RecordingEnded, RecordingListed, Recordings
+from mastctl.answers import RecorderState, RecordingDeleted, RecordingEnded, Recordings
 from mastctl.as_json import readable
 from mastctl.control.machine import StandingFault
 from mastctl.control.publisher import TOPICS, Published, Publisher, Topic
@@ -88,7 +88,7 @@ class Recorder:
         self._file: RecordFile | None = None
         self._run: str | None = None
         self._fault: StandingFault | None = None
-        self._busy_since_s: tuple[float, float] | None = None
+        self._busy_since_s: float | None = None
         self._begun_s = self._retry_s = 0.0
         self._judged_bytes = -1
         self._keep: tuple[float, str] | None = None  # when the ring is kept, and why
@@ -124,19 +124,20 @@ class Recorder:
             free_mb = self._folder.free_bytes() / MB
         except OSError:
             free_mb = None
-        return {"recordings": self._recordings(), "recorder": self.summary(), "free_mb": free_mb}
+        recordings = [one.as_json() for one in self._all()]
+        return {"recordings": recordings, "recorder": self.summary(), "free_mb": free_mb}
 
     def faults(self) -> tuple[StandingFault, ...]:
         """Return what keeps it from recording."""
-        found = [one for one in (self._fault,) if one is not None]
-        busy, file = self._busy_since_s, self._file
-        waits_s = 0.0 if file is None else file.disk_waits_s
-        if busy is None and waits_s > SLOW_S:
-            busy = time.monotonic() - waits_s, self._clock.now_s() - waits_s
-        if busy is not None and time.monotonic() - busy[0] > SLOW_S:
-            message = f"{self._folder.path} does not answer; the record may lack events of this time"
-            found.append(StandingFault(NAME, "slow", message, busy[1], "the disk answers"))
-        return tuple(found)
+        fault, busy_s, file = self._fault, self._busy_since_s, self._file
+        found = () if fault is None else (fault,)
+        waits_s = 0.0 if busy_s is None else time.monotonic() - busy_s
+        waits_s = max(waits_s, 0.0 if file is None else file.disk_waits_s)
+        if waits_s <= SLOW_S:
+            return found
+        message = f"{self._folder.path} does not answer; the record may lack events of this time"
+        since_s = self._clock.now_s() - waits_s
+        return (*found, StandingFault(NAME, "slow", message, since_s, "the disk answers"))
 
     def file(self, name: str, file: str) -> Path:
         """Return a file of a recording, by the names that `listing` has. Raises NotKnown, Unable, and NotNow
@@ -184,9 +185,6 @@ class Recorder:
             message = f"{self._folder.path} did not answer within {ANSWER_S:g} s; the recorder goes on trying"
             raise Unable("slow", message) from None
 
-    def _recordings(self) -> list[RecordingListed]:
-        return [one.as_json() for one in self._all()]
-
     def _all(self) -> list[Recorded]:
         try:
             return self._folder.all()
@@ -213,7 +211,7 @@ class Recorder:
             closing = self._closing
             news = self._news.wait(WAIT_S if self._requests.empty() else 0.0)
             since_s, taken_s = taken_s, time.monotonic()  # these values were published between the two
-            self._busy_since_s = time.monotonic(), self._clock.now_s()
+            self._busy_since_s = time.monotonic()
             self._guarded(lambda: self._write(news, since_s))  # noqa: B023
             while not self._requests.empty():
                 self._answer(*self._requests.get())
@@ -278,7 +276,7 @@ class Recorder:
                 if entry.topic == "mast":
                     self._use_mast()
                 self._notice_fault(entry)
-                file = None if refused else self._file or self._open_ring()
+                file = None if refused else self._file or self._open()
                 if file is not None:
                     file.published_s = since_s
                     if entry.topic == "frame" and not isinstance(entry.value, StampedFrame):
@@ -330,7 +328,11 @@ class Recorder:
         """Flush, go on to the next file, keep the ring after a fault, stay within the bounds."""
         now_s = time.monotonic()
         if self._keep is not None and (now_s >= self._keep[0] or self._closing):
-            self._keep_ring(self._keep[1])
+            reason, self._keep = self._keep[1], None
+            if self._run is None:
+                self._end_file()  # the newest segment is kept too
+            if name := self._folder.keep_ring(reason, self._settings.kept_mb):
+                log.warning("the recording around a fault is kept: %s", name)
         file = self._file
         if file is None:
             return
@@ -349,10 +351,9 @@ class Recorder:
             self._end_file(wait=False)
             self._folder.trim_ring(self._ring_s, self._settings.ring_mb)
 
-    def _disk_is_low(self, least: float | None = None) -> bool:
+    def _disk_is_low(self, factor: float = 1.0) -> bool:
         """End the recording before the disk is full, the ring's oldest first; return whether it was ended."""
-        least = self._settings.free_mb * MB if least is None else least
-        while (free := self._folder.free_bytes()) < least:
+        while (free := self._folder.free_bytes()) < factor * self._settings.free_mb * MB:
             if self._folder.drop_oldest_segment():
                 continue
             reason = (
@@ -364,32 +365,22 @@ class Recorder:
             return True
         return False
 
-    def _keep_ring(self, why: str) -> None:
-        """Move the ring's segments out of its way, the newest too."""
-        self._keep = None
-        if self._run is None:
-            self._end_file()
-        if name := self._folder.keep_ring(why, self._settings.kept_mb):
-            log.warning("the recording around a fault is kept: %s", name)
-
-    def _open_ring(self) -> RecordFile | None:
-        """Open the ring's next segment, if there is to be one now."""
-        if not self._ring_s or time.monotonic() < self._retry_s:
+    def _open(self, run: str | None = None) -> RecordFile | None:
+        """Open a run, or the ring's next segment if there is to be one now, and write what was known last;
+        None if the disk is low.
+        """
+        if run is None and (not self._ring_s or time.monotonic() < self._retry_s):
             return None
-        return self._open(self._folder.next_segment, None)
-
-    def _open(self, path: Callable[[], Path], run: str | None) -> RecordFile | None:
-        """Open a file and write what was known last; None if the disk is low."""
         self._folder.prepare()
-        factor = RESUME_FREE if self._fault is not None and self._fault.code == "disk_low" else 1.0
-        if self._disk_is_low(factor * self._settings.free_mb * MB):
+        before = self._fault
+        if self._disk_is_low(RESUME_FREE if before is not None and before.code == "disk_low" else 1.0):
             return None
+        path = self._folder.next_segment() if run is None else self._folder.next_run(run)
         clocks = Clocks(self._clock.now_s(), time.time_ns())
-        facts = self._facts | ({} if run is None else {"run": run})
-        mast = self._entries.mast
-        file = self._file = RecordFile(path(), [mast.file, *self._others], facts, clocks)
-        self._begun_s, self._run = time.monotonic(), run
-        if run is not None or (self._fault is not None and self._fault.until != NEXT_RUN):
+        facts = self._facts | ({} if run is None else {"run": path.stem})
+        file = self._file = RecordFile(path, [self._entries.mast.file, *self._others], facts, clocks)
+        self._begun_s, self._run = time.monotonic(), None if run is None else path.stem
+        if run is not None or (before is not None and before.until != NEXT_RUN):
             self._fault = None
         file.published_s = time.monotonic()
         self._entries.begin(file, self._clock.now_s())
@@ -405,11 +396,9 @@ class Recorder:
         if self._run is not None:
             raise NotNow("recording", f"the run {self._run} is recorded already; end it first")
         self._end_file()
-        self._folder.prepare()
-        path = self._folder.next_run(name)
-        if not self._open(lambda: path, path.stem):
+        if not self._open(name):
             raise Unable("disk_low", "the disk is full" if self._fault is None else self._fault.message)
-        log.info("run %s is recorded", path.stem)
+        log.info("run %s is recorded", self._run)
         return self.summary()
 
     def _delete(self, name: str) -> RecordingDeleted:
@@ -424,7 +413,7 @@ class Recorder:
         except OSError as error:
             raise Unable("unwritable", f"{name} cannot be deleted: {error.strerror or error}") from None
         log.info("the recording %s was deleted", name)
-        return {"recordings": self._recordings()}
+        return {"recordings": [one.as_json() for one in self._all()]}
 
     def _stop_run(self) -> RecordingEnded:
         file, run = self._file, self._run
