@@ -1,12 +1,4 @@
-"""The log of hand-offs, from which body cameras are corrected.
-
-Keys of a line: ``schema`` (``mastctl/handoff/1``), ``time`` (ISO 8601, UTC), ``mast_digest``,
-``source`` (left and right camera), ``pan_rad``, ``tilt_rad``, ``joint_sigma_rad``, ``left_px``, ``right_px``,
-``sigma_px`` (of each coordinate of those), ``to_pan_rad``, ``to_tilt_rad``, and ``destinations``, by camera:
-``geometric_px``, ``geometric_covariance_px2`` (of the clicks), ``verdict``, ``reason``, ``found_px`` and
-``found_covariance_px2``, the last two null unless the verdict is ``accepted``. Angles are true ones, by the
-joints of the mast file that ``mast_digest`` names.
-"""
+"""The log of hand-offs, from which body cameras are corrected; angles are true ones, by ``mast_digest``."""
 
 from __future__ import annotations
 
@@ -50,7 +42,7 @@ Covariance = Annotated[list[Pair], Field(min_length=2, max_length=2), AfterValid
 
 
 class LandedRecord(Record):
-    """Where a hand-off landed in a camera; what was found where it was accepted."""
+    """Where clicks put a target in a camera, with their covariance; where it was found, if accepted."""
 
     geometric_px: _Pixel
     geometric_covariance_px2: Covariance
@@ -76,7 +68,7 @@ class LandedRecord(Record):
 
 
 class HandoffRecord(Record):
-    """A line of a record of hand-offs."""
+    """A line: a hand-off from the cameras ``source``, ``sigma_px`` of each coordinate of the clicks."""
 
     schema_: Literal["mastctl/handoff/1"] = Field(alias="schema")
     time: Moment

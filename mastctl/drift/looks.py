@@ -48,39 +48,35 @@ def take_pictures(
     """Return an image of each camera at each rest (pan, tilt as read), and why a camera, or one at a rest,
     gave none; bring the head back.
 
-    The client should have the lease. Raises LookEnded if the head is stopped, ClientError if no camera gives
-    an image.
+    The client should have the lease. Raises LookEnded if the head is stopped, or no camera gives an image.
     """
     joints = client.status()["joints"]
-    pictures, missing, left = list[ReferencePicture](), dict[str, str](), list(cameras)
+    pictures, missing = list[ReferencePicture](), dict[str, str]()
     try:
         for pose, (pan_rad, tilt_rad) in enumerate(rests):
             _turn(client, pan_rad, tilt_rad)
-            for camera in tuple(left):
+            for camera in cameras:
                 try:
                     shot = client.snapshot(camera)
                 except ClientError as error:
                     if error.code in NOT_THE_CAMERA:
                         raise
                     missing[f"{camera} at rest {pose}"] = str(error)
-                    if error.code == "bad_frame":
-                        continue  # too dark or too bright at this rest
-                    left.remove(camera)
-                    if not left and not pictures:
-                        raise
                     continue
                 if shot.moving:
-                    raise LookEnded(f"the head moved while {camera} took its picture; nothing was kept")
+                    raise LookEnded(f"the head moved while {camera} took its image; nothing was kept")
                 pictures.append(
                     ReferencePicture(camera, pose, *shot.true_rad, shot.mast_digest, grey(shot.image))
                 )
         if joints is not None:
             _turn(client, joints["pan_rad"], joints["tilt_rad"])
-    except ClientError:
+    except ClientError:  # not after a stop
         if joints is not None:
             with suppress(ClientError, LookEnded):  # refused if another client steers by now
                 _turn(client, joints["pan_rad"], joints["tilt_rad"])
         raise
+    if not pictures:
+        raise LookEnded(f"no camera gave an image: {next(iter(missing.values()), '')}")
     return pictures, missing
 
 

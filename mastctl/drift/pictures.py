@@ -161,9 +161,6 @@ def _look(value: Any) -> dict[str, Any]:
 CONFIRMED = 2
 """So many looks one after the other must see a change before it is reported."""
 
-OLD_S = 7.0 * 86400.0
-"""What was found by a look longer ago than this is reported with the age of the look."""
-
 SILENT = 3
 """So many looks since the last that knew anything, and it is not known any more that all is well."""
 
@@ -193,26 +190,22 @@ def _judged(
     reference: Reference, looks: Sequence[Mapping[str, Any]], now: datetime
 ) -> tuple[Literal["good", "unsure", "bad"], str, str | None]:
     """The level, its sentence, and the first look that saw the change (ISO 8601)."""
+    clear = [one for one in looks if one["views"]]
     if not looks:
         return "unsure", f"no look yet at the reference of {_for_long(reference.time, now)} ago", None
-    clear = [one for one in looks if one["views"]]
+    silent = len(list(takewhile(lambda one: not one["views"], reversed(looks))))
+    nothing = f"{_looks(silent)} recognised nothing: night, fog, other light, another place?"
     if not clear:
-        silent = f"{_looks(len(looks))} recognised nothing: night, fog, other light, another place?"
-        return "unsure", f"{silent} The last {_for_long(looks[-1]['time'], now)} ago", None
-    last = clear[-1]
-    count = len(list(takewhile(lambda one: not one["views"], reversed(looks))))
-    silent = f"; {_looks(count)} since then recognised nothing" if count else ""
-    age = f"last look {_for_long(last['time'], now)} ago"
-    if not last["changed"]:
-        level: Literal["good", "unsure"] = "good" if count < SILENT else "unsure"
-        return level, f"nothing has changed, {_looks(len(clear))}, {age}{silent}", None
+        return "unsure", nothing, None
+    age = f"last look {_for_long(clear[-1]['time'], now)} ago" + (f"; since then {nothing}" if silent else "")
     alike = len(list(takewhile(lambda one: one["changed"], reversed(clear))))
-    first = clear[-alike]["time"]
-    since = _for_long(first, now)
+    if not alike:
+        level: Literal["good", "unsure"] = "good" if silent < SILENT else "unsure"
+        return level, f"nothing has changed, {_looks(len(clear))}, {age}", None
+    first, change = clear[-alike]["time"], clear[-1]["sentence"]
     if alike < CONFIRMED:
-        return "unsure", f"{last['sentence']}, seen once {since} ago: look again{silent}", first
-    old = f" ({age})" if age_s(last["time"], now) > OLD_S else ""
-    return "bad", f"{last['sentence']}, since {since}{old}{silent}", first
+        return "unsure", f"{change}, seen once: look again; {age}", first
+    return "bad", f"{change}, since {_for_long(first, now)}, {age}", first
 
 
 def _looks(count: int) -> str:

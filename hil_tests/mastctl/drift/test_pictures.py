@@ -111,7 +111,7 @@ def test_a_disk_that_is_full_costs_the_new_reference_and_not_the_old(
     [
         ([], "unsure", "no look yet"),
         ([day(1)], "good", "nothing has changed, 1 look, last look 24 h ago"),
-        ([day(4), day(0.01, True)], "unsure", "seen once 14 min ago: look again"),
+        ([day(4), day(0.01, True)], "unsure", "seen once: look again; last look 14 min ago"),
         (
             [day(4), day(3, True), day(1, True)],
             "bad",

@@ -163,7 +163,7 @@ export class MastFile {
   told(status, rig) {
     const { mast, former_mast: former, calibration, sentinel } = status;
     this.drift.className = { good: "", bad: "bad", unsure: "warn", none: "quiet" }[sentinel.level];
-    say(this.drift, `Drift sentinel: ${sentinel.sentence}.${sentinel.age_s === null ? "" : ` Last look ${forTime(sentinel.age_s)} ago.`}`);
+    say(this.drift, `Drift sentinel: ${sentinel.sentence}.`);
     const verdict = calibration ? { good: "holds", drifts: "drifts", few: "too few pointings yet", unknown: "not known" }[calibration.verdict] : "not known";
     const [made, from] = rig.mast_date ? [String(rig.mast_date), "as the file says"] : rig.modified_s ? [moment(rig.modified_s), "the file's own time; it says no date"] : ["", "no date is known"];
     put(byId("mast"), h("span", { class: "name", title: mast.file }, mast.file), h("span", { class: "verdict" }, h("span", { title: from }, made ? `${rig.mast_date ? "made" : "file of"} ${made.slice(0, 10)}` : "no date"), ", ", h("span", { class: calibration?.verdict ?? "" }, verdict)));
