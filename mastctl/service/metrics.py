@@ -101,9 +101,11 @@ class Metrics:
 
     def _counted(self, one: Published) -> None:
         if one.topic == "operation":
-            self._operation(one.value)
+            if one.value.state in ENDED:
+                self._operation(one.value)
         elif one.topic == "command":
-            self._command(one.value)
+            if "result" in one.value:  # not the record of its operation's end
+                self._commands.labels(one.value["command"], one.value["result"]).inc()
         elif one.topic == "frame":
             self._frames.labels(one.key).inc()
         elif one.topic == "joints":
@@ -112,8 +114,6 @@ class Metrics:
                 self._reading.observe(one.value.time_s - before)
 
     def _operation(self, operation: Operation) -> None:
-        if operation.state not in ENDED:
-            return
         record = operation.as_json()
         error = record["error"]
         self._operations.labels(operation.state, "" if error is None else error["code"]).inc()
@@ -126,10 +126,6 @@ class Metrics:
                 if off is not None and sigma:
                     self._residual.observe(abs(off))
                     self._sigmas.observe(abs(off) / sigma)
-
-    def _command(self, record: Mapping[str, Any]) -> None:
-        if "result" in record:  # not the record of its operation's end
-            self._commands.labels(record["command"], record["result"]).inc()
 
     # For the library
 
@@ -175,11 +171,7 @@ class Metrics:
         yield _gauge("calibration_drifts", "1 if the mast file is not valid any more.", drifts)
         judged = {(): float(calibration["pointings"])}
         yield _gauge("calibration_pointings", "Of the last days, that are judged.", judged)
-        if sentinel["reference"] is not None:
-            yield _gauge(
-                "sentinel_drift", "1 if looks found a change.", {(): float(sentinel["level"] == "bad")}
-            )
-            yield _gauge("sentinel_look_age_seconds", "Since the last look.", {(): sentinel["age_s"]})
+        yield _gauge("sentinel_look_age_seconds", "Since the last look.", {(): sentinel["age_s"]})
 
 
 def _gauge(name: str, summary: str, values: Mapping[Any, float | None], *labels: str) -> GaugeMetricFamily:

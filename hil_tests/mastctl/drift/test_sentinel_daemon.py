@@ -102,7 +102,7 @@ def test_a_bumped_camera_is_seen_by_two_looks_and_reported_everywhere(
     assert health["sentinel"]["sentence"].startswith(what)
     text = daemon.service.metrics.text().decode()
     found = {one.name: one for one in text_string_to_metric_families(text)}
-    assert found["mastctl_sentinel_drift"].samples[0].value == 1.0
+    assert found["mastctl_calibration_drifts"].samples[0].value == 1.0
     assert found["mastctl_sentinel_look_age_seconds"].samples[0].value >= 0.0
 
 

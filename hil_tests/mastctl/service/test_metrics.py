@@ -28,7 +28,7 @@ STATUS: Any = {
     ],
     "control": {"holder": "a", "kind": "lease", "for_s": 4.0},
     "calibration": {"verdict": "few", "pointings": 0},
-    "sentinel": {"reference": None},
+    "sentinel": {"age_s": None},
 }
 
 DONE = fake_result((6.0, 1.0, 0.0), 6.2, (0.3, -0.1))
