@@ -18,6 +18,7 @@ from itertools import islice, pairwise, takewhile
 import numpy as np
 
 from calib.geometry.rig import Approach, JointErrors, Pair
+from calib.geometry.rigid import FloatArray
 from drivers.errors import BadReply
 from drivers.interfaces import Reading
 from mastctl.devices.frames import number
@@ -37,8 +38,6 @@ DITHER_S = 1.0  # how long a dither is watched: a dozen readings in each half at
 SAME_RAD = 5e-4  # no change: below a count of any servo that counts on its output side
 TURNING = 7.0  # see RestWatch
 QUIET_SHARE = 0.25  # of the readings that must say rest; fewer is a head that says that it moves
-
-Interval = tuple[float, float]
 
 
 @dataclass(frozen=True)
@@ -104,10 +103,10 @@ class JointHistory:
     (`dithers`) and no move was sent for a second, is treated as resting. ``joints`` are the mast file's.
     """
 
-    def __init__(self, joints: JointErrors | None = None) -> None:
-        self._joints = joints or JointErrors()
+    def __init__(self, joints: JointErrors) -> None:
+        self._joints = joints
         self._readings: deque[Reading] = deque(maxlen=KEPT_READINGS)  # as the driver gave them
-        self._loads = deque[tuple[Interval, Interval]](maxlen=KEPT_READINGS)  # where the loads may be then
+        self._loads: deque[FloatArray] = deque(maxlen=KEPT_READINGS)  # where the loads may be then, (2, 2)
         self._newest: HeadReading | None = None  # with what is true of its motion
         self._moves_s: deque[float] = deque(maxlen=200)
         self._lock = threading.Lock()
@@ -141,14 +140,8 @@ class JointHistory:
             self._follow(reading)
             moving = reading.moving and not self._dithers(reading.time_s)
             read = reading.pan_rad, reading.tilt_rad
-            approach = self._approach(read, _middles(self._loads[-1]))
-            self._newest = HeadReading(
-                *read,
-                moving,
-                reading.time_s,
-                reading.faults,
-                true_rad=self._joints.true_rad(read, approach),
-                approach=approach,
+            self._newest = self._true(
+                read, self._loads[-1].mean(axis=1), moving, reading.time_s, reading.faults
             )
             return self._newest
 
@@ -169,47 +162,44 @@ class JointHistory:
             times_s = [reading.time_s for reading in self._readings]
             first = bisect.bisect_right(times_s, began_s) - 1
             last = bisect.bisect_left(times_s, ended_s)
-            numbers = range(max(first, 0), min(last + 1, len(times_s)))
-            around = [self._readings[i] for i in numbers]
-            loads = [_middles(self._loads[i]) for i in numbers]
-            moves_s = list(self._moves_s)
-            rests = bool(around) and self._dithers(around[-1].time_s)
-        if first < 0 or last >= len(times_s):
-            side = "before" if first < 0 else "after"
-            raise BadReply(f"there is no joint reading {side} the frame's exposure", device=device)
-        stamps_s, pans, tilts = zip(*((one.time_s, one.pan_rad, one.tilt_rad) for one in around), strict=True)
-        seems = any(one.moving for one in around) or max(np.ptp(pans), np.ptp(tilts)) > STILL_RAD
-        moving = (seems and not rests) or any(stamps_s[0] <= sent_s <= stamps_s[-1] for sent_s in moves_s)
-        gap_s = max(np.diff(stamps_s), default=0.0)
-        most_s = LARGEST_GAP_S if moving else LARGEST_GAP_AT_REST_S
-        if gap_s > most_s:
-            gap = f"the joint readings around the exposure are {gap_s:.2f} s apart"
-            raise BadReply(f"{gap}, at most {most_s:g} s is taken", device=device)
-        read = float(np.interp(mid_s, stamps_s, pans)), float(np.interp(mid_s, stamps_s, tilts))
-        pan_load, tilt_load = (float(np.interp(mid_s, stamps_s, load)) for load in zip(*loads, strict=True))
-        with self._lock:
-            approach = self._approach(read, (pan_load, tilt_load))
-            true_rad = self._joints.true_rad(read, approach)
-            return HeadReading(*read, moving, mid_s, true_rad=true_rad, approach=approach)
+            if first < 0 or last >= len(times_s):
+                side = "before" if first < 0 else "after"
+                raise BadReply(f"there is no joint reading {side} the frame's exposure", device=device)
+            around = [self._readings[i] for i in range(first, last + 1)]
+            loads = np.array([self._loads[i].mean(axis=1) for i in range(first, last + 1)])
+            stamps_s = np.array([one.time_s for one in around])
+            angles = np.array([(one.pan_rad, one.tilt_rad) for one in around])
+            seems = any(one.moving for one in around) or np.ptp(angles, axis=0).max() > STILL_RAD
+            moving = any(stamps_s[0] <= sent_s <= stamps_s[-1] for sent_s in self._moves_s) or (
+                bool(seems) and not self._dithers(around[-1].time_s)
+            )
+            gap_s = max(np.diff(stamps_s), default=0.0)
+            most_s = LARGEST_GAP_S if moving else LARGEST_GAP_AT_REST_S
+            if gap_s > most_s:
+                gap = f"the joint readings around the exposure are {gap_s:.2f} s apart"
+                raise BadReply(f"{gap}, at most {most_s:g} s is taken", device=device)
+            pan, tilt, *middles = (
+                float(np.interp(mid_s, stamps_s, values)) for values in np.hstack([angles, loads]).T
+            )
+            return self._true((pan, tilt), np.array(middles), moving, mid_s, ())
 
-    def _plays_rad(self) -> Pair:
-        pan, tilt = self._joints.pan.backlash_rad, self._joints.tilt.backlash_rad
-        return pan or USUAL_PLAY_RAD, tilt or USUAL_PLAY_RAD
+    def _true(
+        self, read: Pair, middles: FloatArray, moving: bool, time_s: float, faults: Sequence[str]
+    ) -> HeadReading:
+        """A reading with what is true, by the middles of where the loads may be, (2,); the lock is kept."""
+        pan, tilt = np.clip((np.array(read) - middles) / self._half_plays(), -1.0, 1.0).round(6).tolist()
+        true_rad = self._joints.true_rad(read, (pan, tilt))
+        return HeadReading(*read, moving, time_s, faults, true_rad=true_rad, approach=(pan, tilt))
+
+    def _half_plays(self) -> FloatArray:
+        joints = self._joints
+        return np.array([one.backlash_rad or USUAL_PLAY_RAD for one in (joints.pan, joints.tilt)]) / 2
 
     def _follow(self, reading: Reading) -> None:
-        """Note where the loads may be once the head is at a reading; the lock is kept."""
-        before = self._loads[-1] if self._loads else (None, None)
-        read = reading.pan_rad, reading.tilt_rad
-        pan, tilt = map(_taken_along, before, read, self._plays_rad())
-        self._loads.append((pan, tilt))
-
-    def _approach(self, read: Pair, loads: Pair) -> Approach:
-        """From which side each axis came, by where its load is; the lock is kept."""
-        pan, tilt = (
-            min(max((at - load) / (play / 2), -1.0), 1.0)
-            for at, load, play in zip(read, loads, self._plays_rad(), strict=True)
-        )
-        return round(pan, 6), round(tilt, 6)
+        """Note the lowest and the highest place of each load behind its play; the lock is kept."""
+        read, half = np.array([[reading.pan_rad], [reading.tilt_rad]]), self._half_plays()[:, None]
+        before = self._loads[-1] if self._loads else np.array([[-np.inf, np.inf]] * 2)  # not known
+        self._loads.append(np.clip(before, read - half, read + half))
 
     def _dithers(self, until_s: float) -> bool:
         """Whether the readings up to a moment are those of a head that dithers at rest; the lock is kept."""
@@ -221,17 +211,6 @@ class JointHistory:
             if window and dithers(window[::-1], for_s=for_s):
                 return True
         return False
-
-
-def _taken_along(load: Interval | None, read_rad: float, play_rad: float) -> Interval:
-    """The lowest and the highest place of a load behind its play; None: its place before is not known."""
-    low, high = read_rad - play_rad / 2, read_rad + play_rad / 2
-    return (low, high) if load is None else (min(max(load[0], low), high), min(max(load[1], low), high))
-
-
-def _middles(loads: tuple[Interval, Interval]) -> Pair:
-    pan, tilt = (0.5 * (low + high) for low, high in loads)
-    return pan, tilt
 
 
 def dithers(readings: Sequence[Reading], tolerance_rad: float = DITHER_RAD, for_s: float = DITHER_S) -> bool:

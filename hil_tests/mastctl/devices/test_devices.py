@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from calib.geometry.mode import SensorMode
+from calib.geometry.rig import JointErrors
 from drivers.clock import SystemClock
 from drivers.errors import BadFrame, BadReply, DriverError, LineLost, NoFreshFrame, NoReply
 from drivers.interfaces import CameraInfo, Frame, FrameTime, Reading
@@ -548,7 +549,7 @@ def test_only_the_newest_frames_are_kept_and_refusals_differ(devices: Devices) -
 
 
 def history(*readings: tuple[float, float, float, bool]) -> JointHistory:
-    made = JointHistory()
+    made = JointHistory(JointErrors())
     for time_s, pan_rad, tilt_rad, moving in readings:
         made.add(Reading(pan_rad, tilt_rad, moving, time_s))
     return made

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from calib.geometry.rig import JointErrors
 from drivers.interfaces import Reading
 from hil_tests.mastctl.devices.turned import Turned
 from hil_tests.mastctl.service_fakes import FakeHardware, rig
@@ -116,7 +117,7 @@ def test_a_head_that_always_says_that_it_moves_does_not_rest() -> None:
 
 
 def history(flags: Callable[[int], bool], angle: Callable[[int], float], count: int = 60) -> JointHistory:
-    made = JointHistory()
+    made = JointHistory(JointErrors())
     for n in range(count):
         made.add(Reading(angle(n), 0.0, flags(n), 10.0 + 0.05 * n))
     return made

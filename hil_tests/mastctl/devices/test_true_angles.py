@@ -111,14 +111,14 @@ def test_a_goal_near_the_turnover_counts_the_side_of_approach(
         assert comes_to_rad == pytest.approx(wanted_rad, abs=1e-12), past_rad
 
 
-def rows(*pans: float, joints: JointErrors | None = None) -> JointHistory:
+def rows(*pans: float, joints: JointErrors) -> JointHistory:
     made = JointHistory(joints)
     for number, pan in enumerate(pans):
         made.add(Reading(pan, 0.0, False, 1.0 + 0.05 * number))
     return made
 
 
-def approach(*pans: float, joints: JointErrors | None = None) -> float:
+def approach(*pans: float, joints: JointErrors) -> float:
     newest = rows(*pans, joints=joints).newest
     assert newest is not None
     return newest.approach[0]
