@@ -169,7 +169,6 @@ class Devices(Cameras):
             self._history.move_sent(self._clock.now_s())
             self.judge.sent(start, goal, speed)
             self._pan_tilt.move(*goal, speed)
-            self._head.moved(ticket)
 
         self._head.call("move", send, MOVE_TIMEOUT_S)
 

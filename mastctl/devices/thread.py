@@ -36,10 +36,9 @@ AFTER_ERROR_S = 0.2  # before the device is tried again between calls
 PATIENCE_S = 0.05  # how long a stop waits for the head's own thread before it goes out beside it
 AT_ONCE_S = 0.002  # the same for a driver that is at its best beside a call under way
 LATEST_SHARE = 1 / 8  # of the time that a head hangs already: a new stop waits no longer for its own thread
-REST_S = 0.3  # after a move was taken, before a reading that says rest is one of its end
+REST_S = 0.3  # after a move or a stop, before a reading that says rest is one of its end
 MAY_MOVE = "the head may still move"
-UNTIL = "a stop is confirmed, or a later move is taken and the head then rests"
-UNTIL_LINE = "the line is back and the head rests, or a stop is confirmed"
+UNTIL = "a stop is confirmed, or the head is read at rest"
 
 
 @dataclass(eq=False)
@@ -340,7 +339,6 @@ class HeadThread(DeviceThread):
         self._patience_s = patience_s
         self._stops_changed = clock.signal()
         self._count = 0
-        self._moved = (-1, 0.0)  # the last move's ticket, and when it was taken
         self._queued_s: float | None = None  # when the stop was requested that waits in the head's thread
         self._inside: list[_Inside] = []
         self._good_s = float("-inf")  # when a stop came back last that went well
@@ -350,7 +348,7 @@ class HeadThread(DeviceThread):
         super().__init__(device, faults=faults, moves="move", clock=clock)
 
     def ticket(self) -> int:
-        """Return what a move hands to `check` and `moved` later. Raises Stopped if a stop is overdue."""
+        """Return what a move hands to `check` later. Raises Stopped if a stop is overdue."""
         with self._stops_changed:
             overdue = self._overdue_stop(self._clock.now_s())
             if overdue:
@@ -365,22 +363,13 @@ class HeadThread(DeviceThread):
             if self._inside:
                 raise Stopped(self._on_its_way(self._inside[0].requested_s, self._clock.now_s()))
 
-    def moved(self, ticket: int) -> None:
-        """Note that the driver took a move."""
-        self._moved = ticket, self._clock.now_s()
-
     def rests(self) -> None:
-        """Note that the head was read at rest.
-
-        That takes back what failed stops left: after a later move, and if only the line was lost.
-        """
-        if self._stop_fault is None:
-            return
-        with self._stops_changed:
-            ticket, moved_s = self._moved
-            proved = ticket == self._count and self._clock.now_s() - moved_s > REST_S
-            if self._stop_fault is not None and (proved or self._stop_fault.until == UNTIL_LINE):
-                self._stop_fault = None
+        """Note that the head was read at rest: what failed stops left is over."""
+        fault = self._stop_fault
+        if fault is not None and self._clock.now_s() - fault.since_s > REST_S:
+            with self._stops_changed:
+                if self._stop_fault is fault and not self._inside:
+                    self._stop_fault = None
 
     def stop(self, timeout_s: float) -> None:
         """Stop the head and return when that is confirmed, by this stop or by another on its way.
@@ -396,11 +385,7 @@ class HeadThread(DeviceThread):
             message = str(error) if MAY_MOVE in str(error) else f"{error}; {MAY_MOVE}"
             with self._stops_changed:
                 since_s = requested_s if self._stop_fault is None else self._stop_fault.since_s
-                only_line = error.code == LineLost.code and (
-                    self._stop_fault is None or self._stop_fault.until == UNTIL_LINE
-                )  # a lost line takes nothing back of what another stop has left
-                until = UNTIL_LINE if only_line else UNTIL
-                self._stop_fault = StandingFault(self._device, error.code, message, since_s, until)
+                self._stop_fault = StandingFault(self._device, error.code, message, since_s, UNTIL)
             raise
         with self._stops_changed:
             self._stop_fault = None
