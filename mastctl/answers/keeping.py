@@ -50,14 +50,10 @@ class CameraMount(TypedDict):
 
 
 class RigSummary(TypedDict):
-    """``GET /rig``: the configured cameras by the mast file in use, its date, its neighbours.
-
-    ``mast_date`` as the file's provenance says it; ``modified_s``: of the file, seconds since 1970 (UTC).
-    """
+    """``GET /rig``: the configured cameras by the mast file in use, its date, its neighbours."""
 
     digest: str
     mast_date: str | None
-    modified_s: float | None
     cameras: dict[str, CameraMount]
     mast_files: list[str]
 

@@ -334,7 +334,7 @@ class CommandEntry:
             if sent.key is None:
                 answer = self._act(command, sent, act, usual_s)
             else:
-                same = {"command": command.name, "request": sent.request}
+                same = {"command": command.name, "request": sent.request, "lease": sent.lease}
                 answer, again = self._answers.once(
                     sent.caller.name, sent.key, same, lambda: self._act(command, sent, act, usual_s)
                 )

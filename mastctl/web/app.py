@@ -13,7 +13,7 @@ from functools import cache
 from importlib.metadata import version
 from typing import Annotated, Any, Literal, Union
 
-from fastapi import FastAPI, Response
+from fastapi import FastAPI, Request, Response
 from fastapi.responses import JSONResponse
 from fastapi.routing import APIRoute
 from fastapi.utils import create_model_field
@@ -21,10 +21,15 @@ from pydantic import BaseModel, Field, TypeAdapter, create_model
 from starlette.types import ASGIApp, Receive, Scope, Send
 from typing_extensions import get_type_hints, is_typeddict
 
-from mastctl.answers import EVENT_VALUES, Count, ErrorBody
-from mastctl.http.guard import Guard
+from mastctl import answers
+from mastctl.answers import EVENT_VALUES, WELL, Count, ErrorBody
+from mastctl.control.lease import Caller
+from mastctl.errors import Unable
+from mastctl.http import PREFIX
+from mastctl.http.guard import Guard, cookie_name, from_this_machine, shown_token
 from mastctl.http.refusals import JsonAnswer, add_errors
-from mastctl.web.commands import REFERENCE, Here, Parts
+from mastctl.service.metrics import CONTENT_TYPE
+from mastctl.web.commands import REFERENCE, Here, Parts, caller_of, file_of
 from mastctl.web.events import add_events
 from mastctl.web.images import add_cameras, add_images
 from mastctl.web.keeping import add_bench, add_masts, add_places, add_recordings
@@ -32,7 +37,8 @@ from mastctl.web.page import add_page, add_site
 from mastctl.web.panorama import add_panoramas, add_targets
 from mastctl.web.simulation import add_simulation
 from mastctl.web.steering import add_estop, add_lease, add_limits, add_pointing, add_tracking
-from mastctl.web.watching import add_sessions, add_watching
+
+COOKIE_S = 12 * 3600
 
 
 def create_app(parts: Parts) -> ASGIApp:
@@ -73,7 +79,7 @@ def api() -> FastAPI:
     add_errors(app)
     for add in (
         *(add_sessions, add_pointing, add_estop, add_lease, add_tracking, add_limits, add_masts, add_places),
-        *(add_recordings, add_bench, add_simulation, add_watching, add_events, add_images, add_page),
+        *(add_recordings, add_bench, add_simulation, add_health, add_events, add_images, add_page),
         *(add_cameras, add_panoramas, add_targets, add_site),
     ):
         add(app)
@@ -83,6 +89,83 @@ def api() -> FastAPI:
         return Response(await here.waiting.run(lambda: description(app)), media_type="application/json")
 
     return app
+
+
+def add_health(app: FastAPI) -> None:
+    """Metrics, health, that of the calibration, and the drift sentinel's findings."""
+
+    @app.get(
+        "/metrics",
+        summary="Figures in the text format of Prometheus",
+        response_class=Response,
+        responses=file_of("text/plain"),
+    )
+    async def metrics(here: Here) -> Response:
+        text = await here.waiting.run(here.service.metrics.text)  # it reads /proc
+        return Response(text, media_type=CONTENT_TYPE)
+
+    @app.get(f"{PREFIX}/health/live", summary="Whether requests are answered: they are")
+    async def live(request: Request, here: Here) -> answers.LiveAnswer:
+        access = here.entrance.access
+        if access is None or not from_this_machine(request):
+            return {"live": True}
+        return {"live": True, "token_folder": access.folder}
+
+    @app.get(
+        f"{PREFIX}/health/ready",
+        summary="Whether commands are carried out: 200 if they are, else 503 and why not",
+    )
+    async def ready(request: Request, here: Here) -> answers.ReadyAnswer:
+        now = here.service.machine.standing
+        reason = "" if caller_of(request).stranger else now.reason  # it may name a person
+        if now.state not in WELL:
+            raise Unable("not_ready", f"{now.state}: {reason}" if reason else now.state)
+        return {"ready": True, "state": now.state, "reason": reason}
+
+    @app.get(
+        f"{PREFIX}/calibration/health",
+        summary="Whether the mast file still holds, with the figures of the last days' residuals",
+    )
+    async def calibration(here: Here) -> answers.CalibrationReport:
+        return here.service.drift.report()
+
+    @app.get(f"{PREFIX}/sentinel", summary="The findings of the drift sentinel, and the age of its last look")
+    async def sentinel(here: Here) -> answers.SentinelAnswer:
+        return here.service.drift.pictures
+
+
+def add_sessions(app: FastAPI) -> None:
+    """The caller, and its cookie."""
+
+    @app.get(f"{PREFIX}/session", summary="The client's name and rights")
+    async def session(request: Request, here: Here) -> answers.ClientSession:
+        return _session(request, here)
+
+    @app.post(f"{PREFIX}/session", summary="Keep the token of this request in the page's cookie")
+    async def keep(request: Request, response: Response, here: Here) -> answers.ClientSession:
+        token = shown_token(request)
+        if here.entrance.access is not None and token is not None:
+            response.set_cookie(
+                cookie_name(request),
+                token,
+                max_age=COOKIE_S,
+                path="/",
+                secure=request.headers.get("origin", "").startswith("https:"),
+                httponly=True,
+                samesite="strict",
+            )
+        return _session(request, here)
+
+    @app.delete(f"{PREFIX}/session", summary="Forget the page's cookie")
+    async def forget(request: Request, response: Response, here: Here) -> answers.ClientSession:
+        response.delete_cookie(cookie_name(request), path="/", httponly=True, samesite="strict")
+        return _session(request, here)
+
+
+def _session(request: Request, here: Here) -> answers.ClientSession:
+    caller: Caller = request.scope["state"]["caller"]
+    needs_token = here.entrance.access is not None
+    return {"name": caller.name, "role": caller.role, "via": caller.via, "needs_token": needs_token}
 
 
 _ONE_MAKES_IT = threading.Lock()

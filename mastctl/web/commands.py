@@ -102,7 +102,6 @@ def command(
     kind: Command,
     *,
     usual_s: Callable[..., float] | None = None,
-    recorded: Callable[..., Mapping[str, Any]] | None = None,
     beside: bool = False,
     status_code: int = 200,
 ) -> Callable[[F], F]:
@@ -111,9 +110,8 @@ def command(
     ``route`` is method and path below the prefix, ``POST /point``. The function takes the path, the query and
     the body, and ``here`` and ``requested`` (`Requested`) if it needs them; its docstring is the route's
     summary. ``usual_s``, of ``here`` and the function's parameters, is an operation's time without a
-    deadline; a ``deadline_s`` in the body counts as the header does, the shorter of both. ``recorded``, of
-    the function's parameters, is what the command is recorded and recognised by, by default path, query and
-    body. ``beside``: it stops something, so it runs in the stops' own threads, and each try is carried out.
+    deadline; a ``deadline_s`` in the body counts as the header does, the shorter of both. ``beside``: it
+    stops something, so it runs in the stops' own threads, and each try is carried out.
     """
     method, _, path = route.partition(" ")
 
@@ -129,7 +127,7 @@ def command(
                 if name in wanted.parameters
             }
             request.scope["state"]["recorded"] = True  # whatever comes of it
-            sent = recorded(**given, **own) if recorded is not None else _request_of(given)
+            sent = _request_of(given)
             allowed_s = None if usual_s is None else usual_s(here, **given)
             deadlines_s = [one for one in (requested.deadline_s, sent.get("deadline_s")) if one is not None]
             requested = replace(requested, request=sent, deadline_s=min(deadlines_s, default=None))

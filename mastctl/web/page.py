@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from fastapi import FastAPI, Request, Response
@@ -72,7 +71,6 @@ def rig_summary(service: Service) -> RigSummary:
     return {
         "digest": stored.digest,
         "mast_date": None if made is None else str(made)[:40],
-        "modified_s": _modified_s(service.masts.in_use.path),
         "cameras": {
             name: _mount(name, camera, stored.rig.stereo, names)
             for name, camera in stored.rig.cameras.items()
@@ -82,40 +80,27 @@ def rig_summary(service: Service) -> RigSummary:
     }
 
 
-def _modified_s(path: Path) -> float | None:
-    try:
-        return path.stat().st_mtime
-    except OSError:  # it was moved since it was read
-        return None
-
-
 def _mount(name: str, camera: RigCamera, stereo: Stereo, names: Collection[str]) -> CameraMount:
     model = camera.model
     width, height = model.size_px
     x, y = (width - 1) / 2, (height - 1) / 2
     places = [(x, y), (0, y), (width - 1, y), (x, 0), (x, height - 1)]
-    pair, side, partner = _partners(name, stereo)
-    middle, left, right, top, bottom = model.ray(np.array(places, dtype=float)).directions
+    pair = next((pair for pair, both in stereo.items() if name in both), None)
+    left, right = (None, None) if pair is None else stereo[pair]
+    partner = right if name == left else left
+    middle, *sides = model.ray(np.array(places, dtype=float)).directions
     return {
         "on": camera.on,
         "size_px": [int(width), int(height)],
         "azimuth_rad": math.atan2(middle[1], middle[0]),
         "elevation_rad": math.asin(float(np.clip(-middle[2], -1.0, 1.0))),
-        "width_rad": _between(left, right),
-        "height_rad": _between(top, bottom),
+        "width_rad": _between(sides[0], sides[1]),
+        "height_rad": _between(sides[2], sides[3]),
         "pair": pair,
-        "side": side,
+        "side": None if pair is None else "left" if name == left else "right",
         "partner": partner if partner in names else None,
     }
 
 
 def _between(one: np.ndarray, other: np.ndarray) -> float:
     return math.atan2(float(np.linalg.norm(np.cross(one, other))), float(one @ other))
-
-
-def _partners(name: str, stereo: Stereo) -> tuple[str | None, Literal["left", "right"] | None, str | None]:
-    """The pair of a camera, which side of it, and the other one."""
-    for pair, (left, right) in stereo.items():
-        if name in (left, right):
-            return pair, "left" if name == left else "right", right if name == left else left
-    return None, None, None

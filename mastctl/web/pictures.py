@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import count
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import cv2
 from anyio import CapacityLimiter
@@ -22,7 +22,8 @@ from anyio.to_thread import run_sync
 
 from drivers.clock import Clock
 from drivers.errors import DriverError
-from mastctl.devices.frames import FrameStore, StampedFrame
+from mastctl.devices.devices import Devices
+from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError
 from mastctl.report.pictures import encoded
 
@@ -44,16 +45,6 @@ REDUCED = ((1, 55), (1, 35), (2, 70), (2, 45), (2, 25), (4, 60), (4, 30))
 """By what a picture's sides are divided, and the quality of its JPEG, the largest first: some 110 kB of
 gravel become 70, 50, 28, 18, 12, 7 and 4."""
 MOST_THREADS = 64
-
-
-class LiveCameras(Protocol):
-    """The cameras, and the frames that are kept for viewers."""
-
-    def watched_frame(
-        self, camera: str, exposed_after_s: float, max_age_s: float, timeout_s: float
-    ) -> StampedFrame: ...
-    @property
-    def store(self) -> FrameStore: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +116,7 @@ class Viewer:
 class CameraFeeds:
     """Pictures of cameras for as long as they have viewers; for the event loop."""
 
-    def __init__(self, cameras: LiveCameras, clock: Clock) -> None:
+    def __init__(self, cameras: Devices, clock: Clock) -> None:
         self._cameras = cameras
         self._stands = clock.stands_for_work
         self._viewers: set[Viewer] = set()

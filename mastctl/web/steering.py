@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import hashlib
 import json
 import math
 import threading
@@ -351,21 +350,13 @@ def add_lease(app: FastAPI) -> None:
         leases = here.service.leases
         return _granted(leases, leases.acquire(requested.caller, **_terms(body, requested)))
 
-    @command(
-        app,
-        "POST /lease/renew",
-        entry.LEASE_RENEW,
-        recorded=lambda requested, body, **_: {
-            "for_s": None if body is None else body.for_s,
-            **_which(requested),
-        },
-    )
+    @command(app, "POST /lease/renew", entry.LEASE_RENEW)
     def renew(here: Here, requested: Requested, body: RenewBody | None = None) -> answers.LeaseGranted:
         """Have the lease run for its time from now on."""
         leases = here.service.leases
         return _granted(leases, leases.renew(_lease_of(requested), None if body is None else body.for_s))
 
-    @command(app, "DELETE /lease", entry.LEASE_RELEASE, recorded=lambda requested, **_: _which(requested))
+    @command(app, "DELETE /lease", entry.LEASE_RELEASE)
     def release(here: Here, requested: Requested) -> answers.LeaseAnswer:
         """Release the lease."""
         leases = here.service.leases
@@ -388,12 +379,6 @@ def _terms(body: LeaseBody, requested: CommandRequest) -> dict[str, Any]:
 
 def _granted(leases: LeaseTable, lease: Lease) -> answers.LeaseGranted:
     return {"lease_id": lease.id, **leases.lease_as_json(lease)}
-
-
-def _which(requested: CommandRequest) -> dict[str, str]:
-    """What tells a lease from another in the record, without being it: a key that came with one is not good
-    for the next."""
-    return {"of": hashlib.sha256(_lease_of(requested).encode()).hexdigest()[:16]}
 
 
 def _lease_of(requested: CommandRequest) -> str:

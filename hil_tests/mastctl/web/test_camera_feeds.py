@@ -63,7 +63,8 @@ async def shown(viewer: Viewer) -> list[Picture]:
 
 @pytest.mark.anyio
 async def test_a_viewer_who_leaves_as_a_picture_comes_keeps_none() -> None:
-    cameras, leaving, left = FakeCameras(), threading.Event(), threading.Event()
+    cameras: Any = FakeCameras()
+    leaving, left = threading.Event(), threading.Event()
 
     def as_kept() -> None:
         leaving.set()
@@ -82,7 +83,7 @@ async def test_a_viewer_who_leaves_as_a_picture_comes_keeps_none() -> None:
 
 @pytest.mark.anyio
 async def test_no_picture_is_taken_while_no_viewer_is_ready() -> None:
-    cameras = FakeCameras()
+    cameras: Any = FakeCameras()
     feeds = CameraFeeds(cameras, SystemClock())
     with feeds.viewer([LEFT], ready=False) as viewer:
         for _ in range(20):
@@ -109,7 +110,7 @@ def test_no_picture_is_sent_while_one_is_on_its_way() -> None:
 @pytest.mark.anyio
 @pytest.mark.parametrize(("every", "apart_s"), [(False, pictures.APART_S), (True, pictures.NEXT_S)])
 async def test_a_viewer_of_every_picture_gets_the_next_one(every: bool, apart_s: float) -> None:
-    cameras = FakeCameras()
+    cameras: Any = FakeCameras()
     feeds = CameraFeeds(cameras, SystemClock())
     with feeds.viewer([LEFT], every=every) as viewer:
         await shown(viewer)

@@ -1,7 +1,7 @@
 // The quiet panels: faults, recording, mast file.
 import { byId, h, keep, kept, put, say, set } from "./dom.js";
 import { ask, fileOf, get, post } from "./api.js";
-import { camera as called, forTime, inDegrees, moment, number, sentence } from "./words.js";
+import { camera as called, forTime, inDegrees, number, sentence } from "./words.js";
 
 const READ = "mastctl read";
 
@@ -165,10 +165,10 @@ export class MastFile {
     this.drift.className = { good: "", bad: "bad", unsure: "warn", none: "quiet" }[sentinel.level];
     say(this.drift, `Drift sentinel: ${sentinel.sentence}.`);
     const verdict = calibration ? { good: "holds", drifts: "drifts", few: "too few pointings yet", unknown: "not known" }[calibration.verdict] : "not known";
-    const [made, from] = rig.mast_date ? [String(rig.mast_date), "as the file says"] : rig.modified_s ? [moment(rig.modified_s), "the file's own time; it says no date"] : ["", "no date is known"];
-    put(byId("mast"), h("span", { class: "name", title: mast.file }, mast.file), h("span", { class: "verdict" }, h("span", { title: from }, made ? `${rig.mast_date ? "made" : "file of"} ${made.slice(0, 10)}` : "no date"), ", ", h("span", { class: calibration?.verdict ?? "" }, verdict)));
+    const [made, from] = rig.mast_date ? [String(rig.mast_date), "as the file says"] : ["", "the file says no date"];
+    put(byId("mast"), h("span", { class: "name", title: mast.file }, mast.file), h("span", { class: "verdict" }, h("span", { title: from }, made ? `made ${made.slice(0, 10)}` : "no date"), ", ", h("span", { class: calibration?.verdict ?? "" }, verdict)));
     const row = (name, value) => h("tr", {}, h("th", { scope: "row" }, name), h("td", {}, value));
-    put(this.facts, row("In use", `${mast.file} (${mast.name})`), row(rig.mast_date ? "Made" : "Written", made ? `${made}, ${from}` : from), row("Digest", h("code", {}, mast.digest.slice(0, 12))),
+    put(this.facts, row("In use", `${mast.file} (${mast.name})`), row("Made", made ? `${made}, ${from}` : from), row("Digest", h("code", {}, mast.digest.slice(0, 12))),
       row("Calibration", sentence(calibration?.sentence) || "No verdict"), former ? row("Before it", former.file) : null);
     const offered = [mast.file, ...rig.mast_files].join();
     if (offered !== this.offered) put(this.choice, rig.mast_files.map((name) => h("option", { value: name, selected: name === mast.file }, name)));

@@ -20,13 +20,6 @@ export function forTime(seconds) {
   return `${Math.floor(seconds / 3600)} h ${Math.floor((seconds % 3600) / 60)} min`;
 }
 
-/** A moment by the clock of this place. */
-export function moment(since1970) {
-  const at = new Date(since1970 * 1000);
-  const two = (value) => String(value).padStart(2, "0");
-  return `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())} ${two(at.getHours())}:${two(at.getMinutes())}`;
-}
-
 /** The time of day of this place, of a moment as the daemon tells it. */
 export const clock = (at) => new Date(at).toLocaleTimeString("en-GB");
 
