@@ -78,7 +78,7 @@ def options(
     if as_json:
         parser.add_argument("--json", action="store_true", help="one JSON document")
     if tasks:
-        add_options(parser, TASKS)
+        add_options(parser, *TASKS)
     return parser
 
 

@@ -47,15 +47,15 @@ def test_a_wait_shows_each_step_as_it_comes(client: Client, go: threading.Event)
 def test_a_daemon_killed_while_a_client_waits_is_one_plain_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    send, waits = DaemonHttp.send, threading.Event()
+    request, waits = DaemonHttp.request, threading.Event()
 
     def noted(self: DaemonHttp, method: str, path: str, **options: Any) -> Any:
-        answer = send(self, method, path, **options)
+        answer = request(self, method, path, **options)
         if "/operations/" in path:
             waits.set()
         return answer
 
-    monkeypatch.setattr(DaemonHttp, "send", noted)
+    monkeypatch.setattr(DaemonHttp, "request", noted)
     with (
         daemon_process(tmp_path, write_config(tmp_path)) as daemon,
         Client(line(daemon)) as client,
@@ -78,7 +78,7 @@ def test_a_wait_goes_on_where_an_answer_is_lost(
     client: Client, go: threading.Event, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     operation = client.point(pan_rad=0.0, tilt_rad=0.0)
-    send, sent = DaemonHttp.send, list[str]()
+    request, sent = DaemonHttp.request, list[str]()
 
     def lossy(self: DaemonHttp, method: str, path: str, **options: Any) -> Any:
         sent.append(path)
@@ -86,9 +86,9 @@ def test_a_wait_goes_on_where_an_answer_is_lost(
             raise Broken("no_daemon", "the connection broke")
         if len(sent) == 4:
             go.set()
-        return send(self, method, path, **options)
+        return request(self, method, path, **options)
 
-    monkeypatch.setattr(DaemonHttp, "send", lossy)
+    monkeypatch.setattr(DaemonHttp, "request", lossy)
     assert client.wait(operation, timeout_s=NET_S)["state"] == "done"
     assert len(sent) >= 4
 

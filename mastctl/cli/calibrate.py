@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from mastctl import signals
 from mastctl.cli import output
-from mastctl.cli.options import Group, at_least, command, finite_number, one_of, option
+from mastctl.cli.options import at_least, command, finite_number, one_of, option
 from mastctl.cli.output import (
     Answer,
     CommandError,
@@ -60,7 +60,7 @@ MODELS = (
     option(
         "--model MODEL",
         "camera model of all cameras: cahv, cahvor, cahvore, opencv4, opencv5, opencv8, opencv12, "
-        "opencv14 or opencv_fisheye (default: as survey.yaml says)",
+        "opencv14 or opencv_fisheye (default: as survey.yaml says); of a bench with FOLDER",
         type=_model,
     ),
     option(
@@ -274,20 +274,15 @@ def _verdict(document: Mapping[str, Any]) -> Iterator[str]:
     option("--wanted-px PX", "wanted error of a first pointing by the calibration alone, rms", default=0.2),
     option("--by-hand", "of a simulated bench: wait for Enter at each placement as at a real one"),
     option("--resume RUN", "go on with a run, by the name that it ended with"),
-    Group(
-        (
-            *MODELS,
-            one_of(
-                option(
-                    "--mast-at X Y Z RX RY RZ",
-                    "the mast's place (metres, radians as in a mast file), as level and tape show it, where "
-                    "pictures cannot show the rover frame (default: as the mast file of the run has it)",
-                    type=finite_number,
-                ),
-                option("--mast-like MAST.yaml", "the mast's place as in this mast file"),
-            ),
+    *MODELS,
+    one_of(
+        option(
+            "--mast-at X Y Z RX RY RZ",
+            "with FOLDER: the mast's place (metres, radians as in a mast file) by level and tape "
+            "(default: as the mast file of the run has it)",
+            type=finite_number,
         ),
-        title="with FOLDER",
+        option("--mast-like MAST.yaml", "with FOLDER: the mast's place as in this mast file"),
     ),
     help="fit cameras, axes and joints to pictures of a board that stands anywhere; drives the head",
     example="--config rig.yaml --board board.yaml --out mast.yaml --report report",

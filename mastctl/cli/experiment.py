@@ -10,13 +10,14 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import mastctl
 from mastctl.cli import output
 from mastctl.cli.daemon import DAEMON, client_of
-from mastctl.cli.options import Group, command, option
+from mastctl.cli.options import command, option
 from mastctl.cli.output import Answer, Shown, WrongUse, check_folder
 from mastctl.cli.rig import HEADS, SPEED, WIRE
 
@@ -35,13 +36,9 @@ STUDIES = {
 """Experiments that are ``tools.studies.NAME`` in a checkout; their own ``--help`` has their options."""
 
 
-TASKS = Group(
-    (
-        option("--executor WHERE", "local: this machine's processes; dask:ADDRESS", default="local"),
-        option("--workers N", "local processes (default: one a processor)"),
-    ),
-    title="tasks",
-    about="where they run (docs/how-to/simulation.md)",
+TASKS = (
+    option("--executor WHERE", "local: this machine's processes; dask:ADDRESS", default="local"),
+    option("--workers N", "local processes (default: one a processor)"),
 )
 """Options of a campaign or study whose cases are tasks: `results_of`."""
 
@@ -52,15 +49,7 @@ TARGETS = (
 )
 
 
-def study_of(argv: Sequence[str]) -> tuple[str, list[str]] | None:
-    """Return the study that a command line names, and its own options; None if it names none."""
-    plain = [at for at, one in enumerate(argv) if not one.startswith("-")][:2]
-    if len(plain) < 2 or argv[plain[0]] != "experiment" or argv[plain[1]] not in STUDIES:
-        return None
-    return argv[plain[1]], [one for at, one in enumerate(argv) if at not in plain]
-
-
-def become_study(name: str, options: Sequence[str]) -> NoReturn:
+def become_study(name: str, options: Any) -> NoReturn:
     """Replace this process by a study of the checkout. Raises WrongUse where there is none."""
     root = Path(mastctl.__file__).parents[1]
     if not (root / "tools" / "studies" / f"{name}.py").is_file():
@@ -73,12 +62,8 @@ def become_study(name: str, options: Sequence[str]) -> NoReturn:
     os.execve(command[0], command, os.environ | {"PYTHONPATH": path})
 
 
-def _study(name: str) -> Callable[[argparse.Namespace], int]:
-    return lambda args: become_study(name, ())
-
-
 for _name, _summary in STUDIES.items():
-    command(f"experiment {_name}", help=f"{_summary} (in a checkout)")(_study(_name))
+    command(f"experiment {_name}", help=f"{_summary} (in a checkout)")(partial(become_study, _name))
 
 
 @command(

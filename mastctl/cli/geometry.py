@@ -46,7 +46,7 @@ def solve_pointing(args: argparse.Namespace) -> Answer:
     from calib.geometry.pointing import solve
 
     stored = read_mast_file(args.mast)
-    camera = stored.rig.cameras[camera_name(stored, args.camera)]
+    camera = stored.rig.cameras[named(args.camera, stored.rig.cameras, stored.path)]
     if camera.on != "head":
         raise WrongUse(f"camera '{args.camera}' is on the rover's body; a camera on the head is expected")
     solutions = solve(
@@ -68,7 +68,7 @@ def triangulate_pair(args: argparse.Namespace) -> Answer:
     from calib.geometry.covariance import clicked_point, stored_covariance
 
     stored = read_mast_file(args.mast)
-    rig, pair = stored.rig, stereo_pair(stored, args.pair)
+    rig, pair = stored.rig, stored.rig.stereo[named(args.pair, stored.rig.stereo, stored.path, "stereo pair")]
     for name in pair:
         need_joints(rig, name, args)
     seen, _ = clicked_point(
@@ -107,10 +107,11 @@ def hand_over(args: argparse.Namespace) -> Answer:
     from calib.geometry.handoff import Joints, hand_off
 
     stored = read_mast_file(args.mast)
-    rig, pair = stored.rig, stereo_pair(stored, args.source)
-    if args.to not in rig.stereo and args.to not in rig.cameras:
-        known = nearest_of(args.to, [*rig.stereo, *rig.cameras])
-        raise WrongUse(f"no stereo pair or camera '{args.to}' in {args.mast}; {known}")
+    rig, pair = (
+        stored.rig,
+        stored.rig.stereo[named(args.source, stored.rig.stereo, stored.path, "stereo pair")],
+    )
+    named(args.to, [*rig.stereo, *rig.cameras], args.mast, "stereo pair or camera")
     to = rig.stereo.get(args.to, (args.to,))
     for name in (*pair, *to):
         need_joints(rig, name, args)
@@ -152,41 +153,25 @@ def tell_notes(notes: Iterable[str]) -> None:
         tell(note)
 
 
-def camera_name(stored: StoredRig, name: str | None) -> str:
-    """Return the camera of this name, the only one by default. Raises WrongUse."""
-    return _named(name, stored.rig.cameras, str(stored.path))
+def named(name: str | None, known: Collection[str], where: Path | None, kind: str = "camera") -> str:
+    """Return the camera, or another thing, of this name; the only one by default. Raises WrongUse."""
+    from calib.files.yaml_text import nearest
 
-
-def _named(name: str | None, cameras: Collection[str], where: str) -> str:
-    if name is None and len(cameras) == 1:
-        return next(iter(cameras))
+    if name is None and len(known) == 1:
+        return next(iter(known))
     if name is None:
-        known = f"--camera with one of {', '.join(cameras)}" if cameras else "one is expected"
-        raise WrongUse(f"{where} holds {len(cameras)} cameras; {known}")
-    if name not in cameras:
-        raise WrongUse(f"no camera '{name}' in {where}; {nearest_of(name, cameras)}")
+        one_of = f"--{kind} with one of {', '.join(known)}" if known else "one is expected"
+        raise WrongUse(f"{where} holds {len(known)} {kind}s; {one_of}")
+    if name not in known:
+        hint = nearest(name, list(known)) if known else "it has none"
+        raise WrongUse(f"no {kind} '{name}' in {where}; {hint}")
     return name
-
-
-def stereo_pair(stored: StoredRig, name: str) -> tuple[str, str]:
-    """Return the cameras (left, right) of a stereo pair. Raises WrongUse."""
-    stereo = stored.rig.stereo
-    if name not in stereo:
-        raise WrongUse(f"no stereo pair '{name}' in {stored.path}; {nearest_of(name, stereo)}")
-    return stereo[name]
 
 
 def need_joints(rig: Rig, name: str, args: argparse.Namespace) -> None:
     """Refuse a camera on the head without --pan and --tilt. Raises WrongUse."""
     if rig.cameras[name].on == "head" and (args.pan is None or args.tilt is None):
         raise WrongUse(f"camera '{name}' is on the head; --pan RAD and --tilt RAD are expected")
-
-
-def nearest_of(name: str, known: Collection[str]) -> str:
-    """Return the nearest of the known names, or all, as a hint."""
-    from calib.files.yaml_text import nearest
-
-    return nearest(name, list(known)) if known else "it has none"
 
 
 def camera_of(
@@ -200,9 +185,9 @@ def camera_of(
             raise WrongUse("the file holds one camera without a name; leave --camera out")
         return "camera", source
     if isinstance(source, dict):
-        name = _named(name, source, str(next(iter(source.values())).path))
+        name = named(name, source, next(iter(source.values())).path)
         return name, source[name]
-    name = camera_name(source, name)
+    name = named(name, source.rig.cameras, source.path)
     camera = source.rig.cameras[name]
     provenance = {"mast_file_sha256": source.digest, **source.rig.provenance}
     left_out = ("the mast file's 'fit' is left out",) if source.rig.fit else ()
@@ -232,9 +217,7 @@ def camera_project(args: argparse.Namespace) -> int:
     """Project points of a CSV table: x_m,y_m,z_m to x_px,y_px."""
     from calib.files.tables import read_table, write_table
 
-    model = _chosen_model(args)
-    points = read_table(args.points, ("x_m", "y_m", "z_m"))
-    pixels, valid = model.project(points)
+    pixels, valid = _chosen_model(args).project(read_table(args.points, ("x_m", "y_m", "z_m")))
     write_table(sys.stdout, ("x_px", "y_px"), pixels)
     _report_empty(args.points, valid, "no pixel")
     return 0
@@ -253,9 +236,7 @@ def camera_ray(args: argparse.Namespace) -> int:
 
     from calib.files.tables import read_table, write_table
 
-    model = _chosen_model(args)
-    pixels = read_table(args.pixels, ("x_px", "y_px"))
-    rays = model.ray(pixels)
+    rays = _chosen_model(args).ray(read_table(args.pixels, ("x_px", "y_px")))
     columns = ("ox_m", "oy_m", "oz_m", "dx", "dy", "dz")
     write_table(sys.stdout, columns, np.hstack([rays.origins_m, rays.directions]))
     _report_empty(args.pixels, rays.valid, "no ray")
@@ -327,7 +308,7 @@ def _chosen_model(args: argparse.Namespace) -> CameraModel:
             raise WrongUse(f"{args.file} has no mast; leave --pan and --tilt out")
         return camera.model
     tell_notes(source.notes)
-    name = camera_name(source, args.camera)
+    name = named(args.camera, source.rig.cameras, source.path)
     need_joints(source.rig, name, args)
     return source.rig.camera_in_rover(name, args.pan or 0.0, args.tilt or 0.0)
 
@@ -365,7 +346,7 @@ def camera_maps(args: argparse.Namespace) -> Answer:
         if args.camera is not None:
             raise WrongUse("--camera and --pair: one of them is expected")
         stored = read_mast_file(args.file)
-        names = stereo_pair(stored, args.pair)
+        names = stored.rig.stereo[named(args.pair, stored.rig.stereo, stored.path, "stereo pair")]
         left, right = (stored.rig.cameras[one] for one in names)
         if left.on != right.on:
             raise WrongUse(f"'{args.pair}' is a pair of two mounts; both on one are expected")
@@ -410,7 +391,7 @@ def camera_mode(args: argparse.Namespace) -> Answer:
     if len(args.bin) > 2:
         raise WrongUse(f"--bin has {len(args.bin)} numbers where one or two are expected")
     stored = read_mast_file(args.file)
-    name = camera_name(stored, args.camera)
+    name = named(args.camera, stored.rig.cameras, stored.path)
     crop_px = None if args.crop is None else (args.crop[0], args.crop[1], args.crop[2], args.crop[3])
     mode = Mode(crop_px, (args.bin[0], args.bin[-1]), FLIPS[args.flip])
     rig = rig_in_mode(stored.rig, name, mode)

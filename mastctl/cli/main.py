@@ -74,7 +74,6 @@ EVERYWHERE = {
     "--url ADDRESS": "of a daemon (default: $MASTCTL_URL, else --config)",
     "--json": "print one JSON document on stdout and nothing else",
     "--version": "print the version",
-    "--print-completion SHELL": "for bash, zsh or tcsh",
 }
 COMMANDS = {name: entry for commands in OVERVIEW.values() for name, entry in commands.items()}
 
@@ -214,17 +213,13 @@ def _run(argv: Sequence[str]) -> int:
 
             sys.stdout.write(f"mastctl {version('mastctl')}\n")
             return 0
-        if argv and argv[0].startswith("--print-completion"):
-            parser = _completing()
-        else:
-            argv, command = _joined(argv)
-            if command == "experiment":
-                from mastctl.cli.experiment import become_study, study_of
+        argv, command = _joined(argv)
+        if command == "experiment" and argv[1:]:
+            from mastctl.cli.experiment import STUDIES, become_study
 
-                if (study := study_of(argv)) is not None:
-                    become_study(*study)
-            parser = build_parser(command)
-        args = parser.parse_args(argv)
+            if argv[1] in STUDIES:
+                become_study(argv[1], argv[2:])
+        args = build_parser(command).parse_args(argv)
     except SystemExit as done:
         return int(done.code or 0)
     args.json = getattr(args, "json", False)
@@ -250,18 +245,6 @@ def _joined(argv: Sequence[str]) -> tuple[list[str], str]:
     if rest and f"{command} {rest[0]}" in COMMANDS:  # a folder of that name is ``./bench``
         command = f"{command} {rest.pop(0)}"
     return [command, *rest], command
-
-
-def _completing() -> Parser:
-    """The whole parser with --print-completion, which prints what makes a shell complete commands."""
-    try:
-        import shtab
-    except ImportError:
-        message = "shtab is not installed, which writes completions: pip install 'mastctl[completion]'"
-        raise output.CommandError("no_shtab", message) from None
-    parser = build_parser()
-    shtab.add_argument_to(parser, "--print-completion")
-    return parser
 
 
 if __name__ == "__main__":

@@ -20,42 +20,34 @@ from mastctl.cli.output import Answer, WrongUse
 Run = Callable[[argparse.Namespace], "Answer | int"]
 
 
-def finite_number(text: str) -> float:
-    """Read a value as a finite number (argparse ``type``)."""
+def _number(text: str, expected: str, fits: Callable[[float], bool] = math.isfinite) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not math.isfinite(value) or "_" in text:
-        raise argparse.ArgumentTypeError(f"'{text}' where a finite number is expected")
+    if not (math.isfinite(value) and fits(value)) or "_" in text:
+        raise argparse.ArgumentTypeError(f"'{text}' where {expected} is expected")
     return value
 
 
-def angle_rad(text: str) -> float:
-    """Read a value as an angle of at most a full turn, radians (argparse ``type``)."""
-    value = finite_number(text)
-    if abs(value) > math.tau:
-        raise argparse.ArgumentTypeError(
-            f"'{text}' where radians are expected, at most {math.tau:.2f} (a full turn); "
-            f"{value:g} degrees are {math.radians(value):.6g}"
-        )
-    return value
+def finite_number(text: str) -> float:
+    """Read a value as a finite number (argparse ``type``)."""
+    return _number(text, "a finite number")
 
 
 def positive_number(text: str) -> float:
     """Read a value as a finite number above zero (argparse ``type``)."""
-    value = finite_number(text)
-    if value <= 0:
-        raise argparse.ArgumentTypeError(f"'{text}' where a number above zero is expected")
-    return value
+    return _number(text, "a number above zero", lambda value: value > 0)
 
 
 def not_negative(text: str) -> float:
     """Read a value as a finite number of zero or more (argparse ``type``)."""
-    value = finite_number(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"'{text}' where zero or more is expected")
-    return value
+    return _number(text, "zero or more", lambda value: value >= 0)
+
+
+def angle_rad(text: str) -> float:
+    """Read a value as an angle of at most a full turn, radians (argparse ``type``)."""
+    return _number(text, "an angle of at most 6.28 radians", lambda value: abs(value) <= math.tau)
 
 
 def at_least(least: int) -> Callable[[str], int]:
@@ -98,28 +90,20 @@ class Option(NamedTuple):
         parser.add_argument(*self.names, **self.settings)
 
 
-class Group(NamedTuple):
-    """Options that exclude each other, or that stand together under a title."""
+class OneOf(NamedTuple):
+    """Options of which one at most may be given, or exactly one."""
 
-    options: tuple[Option | Group, ...]
-    exclusive: bool = False
-    required: bool = False
-    title: str = ""
-    about: str = ""
+    options: tuple[Option, ...]
+    required: bool
 
     def add_to(self, parser: Any) -> None:
-        """Declare them to a parser or a group of one."""
-        if self.title:
-            parser = parser.add_argument_group(self.title, self.about)
-        if self.exclusive:
-            parser = parser.add_mutually_exclusive_group(required=self.required)
-        for one in self.options:
-            one.add_to(parser)
+        """Declare them to a parser."""
+        add_options(parser.add_mutually_exclusive_group(required=self.required), *self.options)
 
 
-def one_of(*options: Option, required: bool = False) -> Group:
+def one_of(*options: Option, required: bool = False) -> OneOf:
     """Return options of which one at most may be given, or exactly one."""
-    return Group(options, exclusive=True, required=required)
+    return OneOf(options, required)
 
 
 def option(usage: str, help: str, *, repeat: bool = False, **settings: Any) -> Option:
@@ -170,7 +154,7 @@ class CommandLine(NamedTuple):
 
     name: str
     help: str
-    options: tuple[Option | Group, ...]
+    options: tuple[Option | OneOf, ...]
     example: str
     about: str
     run: Run
@@ -184,7 +168,7 @@ GROUPS: dict[str, str] = {}
 
 
 def command(
-    name: str, *options: Option | Group, help: str = "", example: str = "", about: str = ""
+    name: str, *options: Option | OneOf, help: str = "", example: str = "", about: str = ""
 ) -> Callable[[Run], Run]:
     """Return a decorator that makes a function a command.
 
@@ -200,7 +184,7 @@ def command(
     return declare
 
 
-def add_options(parser: Any, *options: Option | Group) -> None:
+def add_options(parser: Any, *options: Option | OneOf) -> None:
     """Add declared options to a parser of argparse."""
     for one in options:
         one.add_to(parser)

@@ -250,7 +250,7 @@ def _schema(args: argparse.Namespace) -> Answer | int:
 
 @command(
     "conform",
-    option("[URL]", "a running daemon's address"),
+    option("URL", "a running daemon's address"),
     one_of(
         option("--motion", "move the head, also a real one", default=None),
         option("--no-motion", "only checks that move nothing", dest="motion", action="store_false"),
@@ -262,7 +262,6 @@ def _schema(args: argparse.Namespace) -> Answer | int:
         default=0.3,
     ),
     option("--only CHECK", "a check, or all of a group; may be given often", repeat=True),
-    option("--list", "only list the checks"),
     example="http://127.0.0.1:8420",
 )
 def _conform(args: argparse.Namespace) -> Answer:
@@ -270,12 +269,6 @@ def _conform(args: argparse.Namespace) -> Answer:
     from mastctl.conform.rig_checks import RIG
 
     checks = _chosen(RIG, args.only)
-    if args.list:
-        rows = [(check.name, "moves" if check.moves else "", check.promise) for check in checks]
-        document = {"checks": [{"name": c.name, "promise": c.promise, "moves": c.moves} for c in checks]}
-        return Answer(document, Shown("checks", ("name", "head", "what has to hold"), rows))
-    if args.url is None:
-        raise WrongUse("the address of a daemon is expected, e.g. http://127.0.0.1:8420")
     with rig_under_test(args.url, args.reach) as rig:
         motion = _may_move(args, checks, bool(rig.began.get("simulated")))
         report = check_rig(rig, checks, motion, (lambda outcome: None) if args.json else _show)
@@ -302,7 +295,7 @@ def _chosen(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
     for name in names:
         if not any(name in (check.name, check.name.partition(".")[0]) for check in checks):
             groups = ", ".join(dict.fromkeys(check.name.partition(".")[0] for check in checks))
-            raise WrongUse(f"--only {name}: no such check; groups are {groups}, --list shows all")
+            raise WrongUse(f"--only {name}: no such check; groups are {groups}")
     return [c for c in checks if c.name in names or c.name.partition(".")[0] in names]
 
 

@@ -107,19 +107,18 @@ def serve_config(config: Config, args: argparse.Namespace) -> None:
         option("--operation ID", "show one operation with its steps and what it measured"),
         option("--events TOPIC...", "show each change as it comes, of all or some topics", nargs="*"),
     ),
-    option("--key KEY", "with --events: of these keys only (a device, an id)", repeat=True),
     option("--count N", "with --events: end after so many (default: never)"),
     *DAEMON,
     example="--wait 30",
 )
 def _status(args: argparse.Namespace) -> Answer | int:
-    if args.events is None and (args.key or args.count is not None):
-        raise WrongUse("--key and --count go with --events")
+    if args.events is None and args.count is not None:
+        raise WrongUse("--count goes with --events")
     if args.wait is not None and (args.operations or args.events is not None):
         raise WrongUse("--wait goes with the status alone or with --operation")
     with client_of(args) as client:
         if args.events is not None:
-            return show_each(args, map(_event, client.events(*args.events, keys=args.key)))
+            return show_each(args, map(_event, client.events(*args.events)))
         if args.operations:
             listed = {"operations": client.operations()}
             return Answer(listed, tables_at(listed, LISTED))

@@ -40,24 +40,14 @@ BAUD = option(
 )
 
 
-def _benches() -> dict[str, Any]:
-    from drivers.registry import drivers_of
-
-    return {name: driver.bench for name, driver in drivers_of("head").items()}
-
-
 def _bench(args: argparse.Namespace) -> ServoBench:
-    """The bench of a family of servos. Raises WrongUse, with the commands for a head that has none."""
+    """The bench of a family of servos. Raises WrongUse."""
+    from drivers.registry import drivers_of
     from drivers.servo_bus.bench import ServoBench
 
-    benches = _benches()
-    families = {name: bench for name, bench in benches.items() if isinstance(bench, ServoBench)}
+    heads = drivers_of("head").items()
+    families = {name: one.bench for name, one in heads if isinstance(one.bench, ServoBench)}
     family = args.family or next(iter(families))
-    if family in benches and benches[family] is _unit_bench():
-        raise WrongUse(
-            f"--family: a {family} head has no servos: 'mastctl rig ptu info PORT' queries it, "
-            "'pytest --pyargs mastctl.testing.drivers --rig FILE' tests it"
-        )
     if family not in families:
         raise WrongUse(f"--family is '{family}', expected one of {', '.join(families)}")
     return families[family]
@@ -65,9 +55,9 @@ def _bench(args: argparse.Namespace) -> ServoBench:
 
 def _unit_bench() -> UnitBench:
     """The bench of pan/tilt units."""
-    from drivers.registry import UnitBench
+    from drivers.registry import UnitBench, drivers_of
 
-    return next(bench for bench in _benches().values() if isinstance(bench, UnitBench))
+    return next(one.bench for one in drivers_of("head").values() if isinstance(one.bench, UnitBench))
 
 
 def _link(args: argparse.Namespace, bench: ServoBench) -> Any:

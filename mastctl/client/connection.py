@@ -137,15 +137,11 @@ class DaemonHttp:
         """Send a request, and return a good answer; everything else is a ClientError."""
         if self.lease_id is not None:
             options["headers"] = {"Mastctl-Lease": self.lease_id, **(options.get("headers") or {})}
-        answer = self.send(method, PREFIX + path, **options)
+        with self._failures(f"the daemon at {self.url} took the request but did not answer"):
+            answer = self._http.request(method, PREFIX + path, **options)
         if answer.is_success:
             return answer
         raise self._refused(answer)
-
-    def send(self, method: str, path: str, **options: Any) -> httpx.Response:
-        """Send a request for a path of the whole address, and return the answer whatever it is."""
-        with self._failures(f"the daemon at {self.url} took the request but did not answer"):
-            return self._http.request(method, path, **options)
 
     def events(self, query: Mapping[str, Any]) -> Generator[dict[str, Any], None, None]:
         """Yield the events of the daemon's stream until it ends; ``timeout`` is raised if it falls silent."""

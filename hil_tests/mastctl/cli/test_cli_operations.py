@@ -71,8 +71,7 @@ def test_events_are_a_line_each(pair: BOTH, operation: str, capsys: pytest.Captu
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("status --count 3", "--key and --count go with --events"),
-        ("status --key left", "--key and --count go with --events"),
+        ("status --count 3", "--count goes with --events"),
         ("status --operations --wait 5", "--wait goes with the status alone or with --operation"),
     ],
 )

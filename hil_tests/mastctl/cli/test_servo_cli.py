@@ -134,7 +134,7 @@ def test_set_id_drops_torque_only_when_told_to(bench: Bench, capsys: pytest.Capt
     ("words", "error"),
     [
         (("info", "foo://x", "1"), "expected a serial device or socket"),
-        (("info", "PORT", "1", "--family", "flir_ptu"), "no servos: 'mastctl rig ptu info PORT' queries it"),
+        (("info", "PORT", "1", "--family", "flir_ptu"), "--family is 'flir_ptu', expected one of dynamixel"),
     ],
 )
 def test_wrong_use_is_one_line_and_exit_2(
