@@ -75,8 +75,8 @@ def run(
     """Run a daemon in the main thread until a signal ends it; returns after the mast was stopped.
 
     The signals are those of `mastctl.signals.wanted`. After a second one no client is waited for; SIGTSTP
-    (Ctrl-Z) stops the mast and then suspends the process. ``on_ready`` gets the address when requests are
-    answered; a simulated rover that ``draws_ahead`` then draws its cameras' first pictures.
+    (Ctrl-Z) does nothing. ``on_ready`` gets the address when requests are answered; a simulated rover that
+    ``draws_ahead`` then draws its cameras' first pictures.
 
     Raises AddressInUse, StateInUse before the hardware is touched; BadFile, DriverError.
     """
@@ -263,8 +263,7 @@ async def _serve(opened: _Opened, on_ready: Callable[[Callable[[], None]], objec
     if own_process:
         for number in signals.wanted():
             loop.add_signal_handler(number, end)
-        if signal.getsignal(signal.SIGTSTP) is not signal.SIG_IGN:
-            loop.add_signal_handler(signal.SIGTSTP, _suspend, service)
+        signal.signal(signal.SIGTSTP, signal.SIG_IGN)  # a suspended daemon would watch no head under way
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     serving = asyncio.create_task(server.serve(sockets=[opened.listener]))
     while not server.started and not serving.done():
@@ -362,22 +361,6 @@ def _entry_rules(service: Service, url: str) -> EntryRules:
     if listen.socket is None:
         log.warning("%s speaks plain HTTP: others can read tokens and images unless a proxy encrypts", url)
     return EntryRules(frozenset(listen.hosts), True, access, "token")
-
-
-def _suspend(service: Service) -> None:
-    """Stop the mast, then let the process be suspended: a suspended one watches no head under way."""
-
-    def suspend(stopped: Future[str | None]) -> None:
-        error = stopped.exception()
-        if error is None:
-            os.kill(os.getpid(), signal.SIGSTOP)
-        else:
-            log.error("not suspended: the stop failed and the head may still move: %s", error)
-
-    try:
-        service.stop_threads.submit(service.stopping.stop).add_done_callback(suspend)
-    except StopsHang as error:
-        log.error("not suspended: the head could not be stopped and may still move: %s", error)
 
 
 @contextlib.contextmanager

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import gc
-import os
 import signal
 import socket
 import stat
 import threading
 import weakref
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from drivers.errors import DriverError
 from hil_tests.mastctl.outside_daemon import daemon_process, line, write_config
 from hil_tests.mastctl.service_fakes import (
     Hang,
@@ -26,10 +23,9 @@ from hil_tests.waiting import NET_S, until
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.control import operations as operations_module
-from mastctl.daemon import AddressInUse, RunningDaemon, _suspend
+from mastctl.daemon import AddressInUse, RunningDaemon
 from mastctl.devices import devices as devices_module
 from mastctl.service import service as service_module
-from mastctl.service.stopping import StopThreads
 
 
 def test_a_signal_while_the_daemon_starts_ends_it_cleanly(tmp_path: Path) -> None:
@@ -139,28 +135,6 @@ def test_the_end_is_bounded_although_everything_hangs(
     for words in ("did not confirm", "is given up", "is left behind"):
         assert words in caplog.text
     hang.let_go()
-
-
-def test_a_daemon_whose_mast_did_not_stop_is_not_suspended(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    signals: list[int] = []
-    own = os.getpid()
-    monkeypatch.setattr(
-        "mastctl.daemon.os.kill", lambda process, number: signals.append(number) if process == own else None
-    )
-
-    def stop() -> None:
-        raise DriverError("the head did not confirm the stop", device="pan_tilt")
-
-    threads = StopThreads()
-    service = SimpleNamespace(stop_threads=threads, stopping=SimpleNamespace(stop=stop))
-    _suspend(service)  # type: ignore[arg-type]
-    until(lambda: signals or "not suspended" in caplog.text, "the signal or the refusal")
-    threads.close()
-    assert signals == []
-    assert "not suspended: the stop failed and the head may still move" in caplog.text
-    assert "the head did not confirm the stop" in caplog.text
 
 
 def test_a_part_that_cannot_be_closed_keeps_no_other_open(

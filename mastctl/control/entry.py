@@ -24,13 +24,12 @@ from typing import Any, TypeVar
 
 from drivers.clock import Clock, SystemClock
 from mastctl.answers import Role
-from mastctl.as_json import writable
+from mastctl.as_json import append_line, writable
 from mastctl.control.lease import ANONYMOUS, Caller, LeaseTable, StopCame
 from mastctl.control.machine import Need, StandingFault
 from mastctl.control.operations import OperationRunner
 from mastctl.control.publisher import Publisher
 from mastctl.errors import BadRequest, MastctlError, NotNow, Stopped, error_body, one_line
-from mastctl.json_lines import append_line
 
 log = logging.getLogger(__name__)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -13,10 +14,10 @@ from queue import Empty, SimpleQueue
 from typing import Any, Generic, TypeVar
 
 from calib.errors import BadFile
-from calib.files import replace_bytes
+from calib.files import open_plain, replace_bytes
 from drivers.clock import Clock, SystemClock
+from mastctl.as_json import OtherFile, append_line
 from mastctl.control.machine import StandingFault
-from mastctl.json_lines import OtherFile, append_line, read_lines
 
 log = logging.getLogger(__name__)
 Line = TypeVar("Line", bound=Mapping[str, Any])
@@ -50,7 +51,7 @@ class Journal(Generic[Line]):
     def read(self) -> list[Line]:
         """Return the records, oldest first; lines that are none are left out, and logged. Raises BadFile."""
         try:
-            lines = read_lines(self.path, 2 * self._most_bytes if self._most_bytes else NEWEST_BYTES)
+            lines = _newest_lines(self.path, 2 * self._most_bytes if self._most_bytes else NEWEST_BYTES)
         except OSError as error:
             raise BadFile(self.path, "", f"cannot be read: {error.strerror or error}") from None
         records = []
@@ -83,6 +84,17 @@ class Journal(Generic[Line]):
 
 def _line(record: Mapping[str, Any]) -> bytes:
     return (json.dumps(record, allow_nan=False) + "\n").encode()
+
+
+def _newest_lines(path: Path, most_bytes: int) -> list[bytes]:
+    """Return a file's lines, of the newest so many bytes; none without a file."""
+    try:
+        with open_plain(path) as file:
+            start = max(0, os.fstat(file.fileno()).st_size - most_bytes)
+            file.seek(start)
+            return file.read(most_bytes).splitlines()[1 if start else 0 :]
+    except FileNotFoundError:
+        return []
 
 
 class JournalThread:

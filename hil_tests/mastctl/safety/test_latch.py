@@ -21,7 +21,6 @@ from hil_tests.mastctl.outside_daemon import daemon_process, line, write_config
 from hil_tests.mastctl.service_fakes import CONFIG, Hang, ScriptedLoop, fake_daemon
 from hil_tests.waiting import NET_S, present, until
 from mastctl.client import Client, ClientError
-from mastctl.control import machine as machine_module
 from mastctl.control.machine import Latched
 from mastctl.errors import NotNow, Stopped, Unable
 from mastctl.safety import latch as latch_module
@@ -221,17 +220,6 @@ def test_after_an_emergency_stop_nothing_moves_whatever_way_it_comes(
         assert client.status()["estop"] is None
         client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))
         assert [call for call in hardware.head.calls if call[0] == "move"]
-
-
-def test_an_operation_that_slips_in_while_it_is_latched_fails_at_the_gate(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    with fake_daemon(monkeypatch, tmp_path) as (daemon, hardware), Client(daemon.url) as client:
-        monkeypatch.setattr(machine_module.Standing, "refusal", lambda now, need: None)
-        client.estop()
-        record = client.wait(client.point(pan_rad=0.1, tilt_rad=0.1))
-        assert (record["state"], present(record["error"])["code"]) == ("failed", "estopped")
-        assert not [call for call in hardware.head.calls if call[0] == "move"]
 
 
 @pytest.mark.parametrize(
