@@ -317,12 +317,9 @@ class CommandEntry:
     ) -> Answer:
         """Carry out a command by ``act``; return its answer, whose ``id`` or ``operation`` names what runs.
 
-        ``usual_s`` is the time allowed for an operation without a deadline, seconds.
-
-        Raises NotAllowed ``role``; BadRequest ``key_reused``; ``bad_request`` for a key without a name where
-        a lease is granted; NotNow ``deadline_passed`` if its time was over before it began; ``leased``,
-        ``lease_over``, ``lease_unknown``; ``key_in_use``; ``stopped`` if a stop came since it was sent; what
-        the state refuses.
+        ``usual_s`` is the time allowed for an operation without a deadline, seconds. Raises NotAllowed
+        ``role``; NotNow ``deadline_passed`` if its time was over before it began, ``stopped`` if a stop came
+        since it was sent; as `Answers.once` and `LeaseTable.steering`; what the state refuses.
         """
         again = False
         try:
@@ -401,13 +398,12 @@ class CommandEntry:
         self, command: Command, sent: CommandRequest, act: Callable[[], Answer], usual_s: float | None
     ) -> Answer:
         """Carry it out if no check fails; its operation gets its deadline."""
+        name = command.name
         if sent.deadline_s is not None and sent.came_s + sent.deadline_s <= self._clock.now_s():
-            message = f"the {sent.deadline_s:g} s for {command.name} were over before it could begin"
+            message = f"the {sent.deadline_s:g} s for {name} were over before it could begin"
             raise NotNow("deadline_passed", message)
         if self._stopped_since(command, sent):
-            raise Stopped(
-                f"{command.name} was requested before a stop, and is not carried out; send it again"
-            )
+            raise Stopped(f"{name} was requested before a stop, and is not carried out; send it again")
         with self.leases.steering(sent.caller, sent.lease) if command.steers else nullcontext():
             refusal = None if command.need is None else self._operations.refusal(command.need)
             if refusal is not None:

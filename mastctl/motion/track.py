@@ -140,27 +140,22 @@ class TrackStatus:
         """(3, 3) of the position."""
         return None if self.track is None else self.track.target_covariance_m2
 
-    def carried_to(self, pose: RoverPose) -> TrackStatus:
-        """Return it carried to a pose with a covariance."""
-        assert self.track is not None and self.stands_at is not None and pose.covariance is not None
-        moved = moved_track(self.track, motion_between(self.stands_at, pose), pose.covariance)
-        return replace(self, track=moved, stands_at=pose)
-
-    def jump(self, pose: RoverPose, origin_m: FloatArray, most_step: float) -> str:
-        """Return how far a pose is from the one before, if that is too far to carry the track over.
+    def carried_to(self, pose: RoverPose, origin_m: FloatArray, most_step: float) -> TrackStatus | str:
+        """Return it carried to a pose with a covariance, or why not: the pose jumped.
 
         ``origin_m`` is (3,), from where the target's range counts, rover frame; ``most_step`` the longest
         way, as a part of that range.
         """
-        assert self.track is not None and self.stands_at is not None
+        assert self.track is not None and self.stands_at is not None and pose.covariance is not None
+        motion = motion_between(self.stands_at, pose)
         range_m = float(np.linalg.norm(self.track.position_m - origin_m))
-        way_m = float(np.linalg.norm(motion_between(self.stands_at, pose).translation_m))
-        if way_m <= most_step * range_m:
-            return ""
-        return (
-            f"the pose jumped by {way_m:.2f} m with the target {range_m:.2f} m away; a track is carried over "
-            f"at most {most_step:g} of the range at a time; begin the track again"
-        )
+        way_m = float(np.linalg.norm(motion.translation_m))
+        if way_m > most_step * range_m:
+            return (
+                f"the pose jumped by {way_m:.2f} m with the target {range_m:.2f} m away; a track is carried "
+                f"over at most {most_step:g} of the range at a time; begin the track again"
+            )
+        return replace(self, track=moved_track(self.track, motion, pose.covariance), stands_at=pose)
 
     def as_json(self, now_s: float) -> TrackAnswer:
         """Return it as ``GET /track`` has it."""
@@ -214,18 +209,18 @@ class Tracker:
         rig: Rig,
         limits: Limits,
         clock: Clock,
-        settings: TrackingSettings | None = None,
-        on_matched: Callable[[MatchedHandoff], None] = lambda matched: None,
-        machine: StateMachine | None = None,
+        settings: TrackingSettings,
+        on_matched: Callable[[MatchedHandoff], None],
+        machine: StateMachine,
     ) -> None:
         self.moved_s: float | None = None
-        self._machine = machine or StateMachine(clock)
+        self._machine = machine
         self._operations = operations
         self._devices = devices
         self._rig = rig
         self._limits = limits
         self._clock = clock
-        self._settings = settings or TrackingSettings()
+        self._settings = settings
         self._on_matched = on_matched
         self._lock = threading.Lock()
         self._status = TrackStatus()
@@ -267,9 +262,7 @@ class Tracker:
             )
             return operation
 
-    def take_pose(
-        self, pose: RoverPose, look: bool, on_taken: Callable[[RoverPose], None] = lambda pose: None
-    ) -> str | None:
+    def take_pose(self, pose: RoverPose, look: bool, on_taken: Callable[[RoverPose], None]) -> str | None:
         """Carry the track over to the rover's present pose and ``look`` for its target.
 
         The first pose ends a track that began without one. ``on_taken`` gets a pose that is not refused,
@@ -304,11 +297,12 @@ class Tracker:
                 moved = stood is not None and not is_still(motion_between(stood, pose))
                 status = replace(status, predicted=status.predicted or moved)
                 if status.track is not None:
-                    jump = status.jump(pose, self._rig.mast.translation_m, self._settings.most_step)
-                    if jump:
-                        self._end(status, jump)
+                    origin_m, most_step = self._rig.mast.translation_m, self._settings.most_step
+                    carried = status.carried_to(pose, origin_m, most_step)
+                    if isinstance(carried, str):
+                        self._end(status, carried)
                         return None
-                    status = status.carried_to(pose)
+                    status = carried
                 if status.operation is not None:
                     self._moved = self._moved or moved
                     self._look_again = self._look_again or look

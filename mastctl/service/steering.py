@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeVar
 
@@ -74,19 +74,20 @@ class Steering:
         self._drift = drift
         self._repeat_after_s = REPEAT_AFTER_S if repeat_after_s is None else repeat_after_s
 
-    def point(self, request: PointRequest, recorded: Mapping[str, Any]) -> Operation:
-        """Start a pointing operation and return its first record; ``recorded`` is the request as it came.
+    def point(self, request: PointRequest) -> Operation:
+        """Start a pointing operation and return its first record.
 
         Raises NotKnown, NoLonger, BadRequest if camera, frame, pixel or joint angles do not fit this rig;
         NotNow if the frame is of another mast file, head or rover moved since, or as
         `mastctl.control.operations.OperationRunner.start`.
         """
+        recorded = request.model_dump(exclude_none=True)
         clicked = None if request.panorama is None else self._panoramas.seen(request.panorama)
         with self._masts.unchanged() as mast:
             view_rad = None
             if clicked is not None:
                 request, view_rad = self._panoramas.pointed(request, clicked[0], clicked[1][0])
-                recorded = recorded if request.pixel is None else {**recorded, "pixel": request.pixel}
+                recorded |= {} if request.pixel is None else {"pixel": request.pixel}
             request = self._in_rover(request)
             self._check(request, clicked is not None)
             loop = self._loop()
@@ -117,11 +118,12 @@ class Steering:
             request, frames[:1] if target.by_direction else frames, seen.pixel_px, seen.range_m
         )
 
-    def start_track(self, request: TrackRequest, recorded: Mapping[str, Any]) -> Operation:
+    def start_track(self, request: TrackRequest) -> Operation:
         """Begin to follow what a pixel shows, or what is seen at a position; return the start's record.
 
         Raises as `point`; NotNow ``busy`` also while a track runs.
         """
+        recorded = {"track": request.model_dump(exclude_none=True)}
         with self._masts.unchanged():
             request = self._in_rover(request)
             if request.pixel is not None:

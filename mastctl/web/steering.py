@@ -179,7 +179,7 @@ def add_pointing(app: FastAPI) -> None:
     )
     def point(body: PointRequest, here: Here) -> answers.Started:
         """Point at a pixel, a position, or joint angles."""
-        return {"id": here.service.steering.point(body, body.model_dump(exclude_none=True)).id}
+        return {"id": here.service.steering.point(body).id}
 
     @app.post(f"{PREFIX}/point/preview", summary="The point at a pixel, before anything moves")
     async def preview(body: PointRequest, here: Here) -> answers.Preview:
@@ -287,8 +287,7 @@ def add_tracking(app: FastAPI) -> None:
     @command(app, "POST /track", entry.TRACK, status_code=202, usual_s=one_look_s)
     def start(body: TrackRequest, here: Here) -> answers.Started:
         """Follow what a pixel shows, or is at a position."""
-        recorded = {"track": body.model_dump(exclude_none=True)}
-        return {"id": here.service.steering.start_track(body, recorded).id}
+        return {"id": here.service.steering.start_track(body).id}
 
     @command(app, "POST /track/look", entry.TRACK_LOOK, status_code=202, usual_s=one_look_s)
     def look(here: Here) -> answers.Started:

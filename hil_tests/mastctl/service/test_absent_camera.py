@@ -145,7 +145,7 @@ def test_the_service_starts_with_a_camera_absent_and_the_others_serve(bench: Ben
             service.snapshot("navcam_left", fresh=True)
         assert len(told(service, "navcam_left")) == 1, "one thing wrong is told once"
         assert service.snapshot("navcam_right", fresh=True).camera == "navcam_right"
-        done = service.steering.point(PointRequest(pan_rad=0.1, tilt_rad=0.0), {})
+        done = service.steering.point(PointRequest(pan_rad=0.1, tilt_rad=0.0))
         until(lambda: service.operations.get(done.id).state != "running", "the pointing's end")
         assert service.operations.get(done.id).state == "done"
 

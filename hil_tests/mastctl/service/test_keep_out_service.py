@@ -30,7 +30,7 @@ def service() -> Iterator[Service]:
 
 
 def pointed(service: Service, pan_rad: float, tilt_rad: float) -> Any:
-    name = service.steering.point(PointRequest(pan_rad=pan_rad, tilt_rad=tilt_rad), {}).id
+    name = service.steering.point(PointRequest(pan_rad=pan_rad, tilt_rad=tilt_rad)).id
     until(lambda: service.operations.get(name).ended_s is not None, f"the end of operation {name}")
     return service.operations.get(name).as_json()
 
@@ -44,7 +44,7 @@ def test_a_pointing_through_a_keep_out_names_it_and_a_free_goal(service: Service
     assert service.devices.read().pan_rad == before.pan_rad
     assert pointed(service, 1.478, 0.0)["state"] == "done"
     with pytest.raises(KeptOut, match="keep-out deck"):
-        service.steering.point(PointRequest(pan_rad=0.0, tilt_rad=-0.5), {})
+        service.steering.point(PointRequest(pan_rad=0.0, tilt_rad=-0.5))
 
 
 def test_a_head_in_a_keep_out_is_a_fault_and_may_only_leave_it(service: Service) -> None:

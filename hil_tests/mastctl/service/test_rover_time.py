@@ -49,7 +49,7 @@ def a_run(seed: int, pause_s: float) -> tuple[str, list[np.ndarray[Any, Any]]]:
             frame = service.snapshot("navcam_left", fresh=True)
             pictures.append(frame.image)
             request = PointRequest(pixel=PixelTarget("navcam_left", frame.frame_id, u_px, v_px))
-            told.append(ended(service, service.steering.point(request, {"pixel": [u_px, v_px]}).id))
+            told.append(ended(service, service.steering.point(request).id))
             time.sleep(pause_s)
         told.append(service.status())
     return json.dumps(told, sort_keys=True), pictures
@@ -67,7 +67,7 @@ def test_runs_of_one_seed_are_equal_to_the_last_bit() -> None:
 def test_the_head_takes_its_time_on_the_rovers_clock_only() -> None:
     with service_at("max") as service:
         began_s = service.clock.now_s()
-        told = ended(service, service.steering.point(PointRequest(pan_rad=2.0, tilt_rad=-0.5), {}).id)
+        told = ended(service, service.steering.point(PointRequest(pan_rad=2.0, tilt_rad=-0.5)).id)
         assert told["state"] == "done"
         assert told["steps"]
         times_s = [began_s, told["created_s"], told["started_s"]]
@@ -95,7 +95,7 @@ def test_a_deadline_is_one_of_the_rovers_time() -> None:
 def test_a_stop_overtakes_a_move_that_nobody_waits_for() -> None:
     with service_at("max") as service:
         with service.clock.at_work():  # no time passes but what is slept here: the head is under way
-            moving = service.steering.point(PointRequest(pan_rad=2.5, tilt_rad=0.0), {}).id
+            moving = service.steering.point(PointRequest(pan_rad=2.5, tilt_rad=0.0)).id
             service.clock.sleep(1.0)
             service.stopping.stop()
         told = ended(service, moving)

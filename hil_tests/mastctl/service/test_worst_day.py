@@ -41,7 +41,7 @@ def pointed(service: Service, pixel_px: tuple[float, float]) -> tuple[Any, np.nd
     assert rover is not None
     point_m = present(rover.true_point("navcam_left", frame.sequence, pixel_px))
     name = service.steering.point(
-        PointRequest(pixel=PixelTarget("navcam_left", frame.frame_id, *pixel_px), pointings=2), {}
+        PointRequest(pixel=PixelTarget("navcam_left", frame.frame_id, *pixel_px), pointings=2)
     ).id
     until(lambda: service.operations.get(name).ended_s is not None, f"the end of operation {name}")
     told = service.operations.get(name).as_json()
