@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.adjust.result import BenchCalibration
 from calib.adjust.solver import covariance_of
@@ -112,7 +111,7 @@ class BenchKnowledge:
 
     def pictures(self) -> int:
         """Return how many pictures the camera with most of them has."""
-        counts = Counter(one.camera for _, _, look in self.looks for one in look.found)
+        counts = Counter(camera for _, _, look in self.looks for camera in look.corners)
         return max(counts.values(), default=0)
 
     def cameras_for(self, name: str) -> list[str]:
@@ -141,7 +140,7 @@ class BenchKnowledge:
                     )
                 except (Unreachable, CalibError, ValueError):
                     continue
-                mine = [look for look in self.of(name) if any(one.camera == camera for one in look.found)]
+                mine = [look for look in self.of(name) if camera in look.corners]
                 if all((np.abs(np.subtract((one.pan_rad, one.tilt_rad), at)) > apart).any() for one in mine):
                     yield BenchShot(name, *at, ())
 
@@ -161,22 +160,23 @@ class BenchKnowledge:
 
     def _coverage(self) -> dict[str, Coverage]:
         """How many corners were seen in each of `CELLS` of each camera's image, row by row."""
-        sizes = {name: camera.model.size_px for name, camera in self.now.rig.cameras.items()}
-        counts: dict[str, NDArray[np.int64]] = {name: np.zeros(MOST_CELLS, np.int64) for name in sizes}
-        for _, check, look in self.looks:
-            for one in () if check else look.found:
-                if one.corners is None or one.camera not in sizes:
-                    continue
-                edges = [(-0.5, size - 0.5) for size in sizes[one.camera]]
-                x, y = np.clip(one.corners.pixels_px, *np.transpose(edges)).T
-                found, _, _ = np.histogram2d(y, x, bins=CELLS[::-1], range=edges[::-1])
-                counts[one.camera] += found.astype(np.int64).ravel()
-        return {name: {"size_px": list(size), "cells": counts[name].tolist()} for name, size in sizes.items()}
+        shown: dict[str, Coverage] = {}
+        for name, camera in self.now.rig.cameras.items():
+            size = camera.model.size_px
+            corners = [look.corners.get(name) for _, check, look in self.looks if not check]
+            pixels = np.concatenate(
+                [np.empty((0, 2)), *(one.pixels_px for one in corners if one is not None)]
+            )
+            x, y = np.clip(pixels, -0.5, np.subtract(size, 0.5)).T
+            edges = [(-0.5, extent - 0.5) for extent in size[::-1]]
+            counts, _, _ = np.histogram2d(y, x, bins=CELLS[::-1], range=edges)
+            shown[name] = {"size_px": list(size), "cells": counts.astype(int).ravel().tolist()}
+        return shown
 
     def untied(self) -> list[str]:
         """Return the body cameras that have seen too few of the placements that the head saw."""
         on_head = [c for c, camera in self.now.rig.cameras.items() if camera.on == "head"]
-        seen = [(name, {one.camera for one in look.found}) for name, check, look in self.looks if not check]
+        seen = [(name, set(look.corners)) for name, check, look in self.looks if not check]
         by_head = {name for name, cameras in seen if cameras & set(on_head)}
         return [
             body
@@ -252,20 +252,19 @@ class BenchKnowledge:
 
     def _shot(self, name: str, look: BenchLook) -> BenchShot:
         views = tuple(
-            BoardView(one.camera, self.board.in_board_m(one.corners.ids), self._scale * one.corners.sigma_px)
-            for one in look.found
-            if one.corners is not None and one.camera in self.now.rig.cameras
+            BoardView(camera, self.board.in_board_m(corners.ids), self._scale * corners.sigma_px)
+            for camera, corners in look.corners.items()
+            if camera in self.now.rig.cameras
         )
         return BenchShot(name, look.pan_rad, look.tilt_rad, views, look.pan_approach, look.tilt_approach)
 
     def _board_from(self, look: BenchLook) -> Rigid:
         """Where the board is, by the picture that shows most of it."""
-        one = max(look.found, key=lambda seen: 0 if seen.corners is None else len(seen.corners))
-        assert one.corners is not None
+        camera, corners = max(look.corners.items(), key=lambda one: len(one[1]))
         sides = look.pan_approach, look.tilt_approach
         true_rad = self.now.rig.joints.true_rad((look.pan_rad, look.tilt_rad), sides)
-        in_board_m = self.board.in_board_m(one.corners.ids)
-        return rover_from_board(self.now.rig, one.camera, *true_rad, in_board_m, one.corners.pixels_px)
+        in_board_m = self.board.in_board_m(corners.ids)
+        return rover_from_board(self.now.rig, camera, *true_rad, in_board_m, corners.pixels_px)
 
 
 def corner_noise(fit: BenchCalibration, survey: Survey) -> tuple[float, float]:

@@ -127,6 +127,11 @@ class BenchLook:
         """The images that show the board."""
         return tuple(one for one in self.seen if one.corners is not None)
 
+    @property
+    def corners(self) -> dict[str, Corners]:
+        """The board's corners by camera."""
+        return {one.camera: one.corners for one in self.seen if one.corners is not None}
+
 
 @dataclass(frozen=True, eq=False)
 class BenchHead:

@@ -6,7 +6,7 @@ rig. Where the target lands then is by the true one. The paper's sections IV and
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -95,31 +95,6 @@ def position_error_px(
         believed.mast, model, position_m, middle, from_pan_rad=pan_rad, from_tilt_rad=tilt_rad
     )[0]  # fmt: skip
     return np.asarray(seen(true, camera, angles.pan_rad, angles.tilt_rad, target_m) - middle)
-
-
-def handoff_errors_px(
-    believed: Rig,
-    true: Rig,
-    pair: tuple[str, str],
-    to: tuple[str, ...],
-    pan_rad: float,
-    tilt_rad: float,
-    target_m: FloatArray,
-    left_px: ArrayLike,
-    right_px: ArrayLike,
-) -> Mapping[str, FloatArray]:
-    """Return by camera how far (2,), pixels, a hand-off puts a target from where it truly is.
-
-    Cameras of ``to`` whose image does not hold the target are left out. Raises CalibError as above.
-    """
-    left, right = (believed.camera_in_rover(name, pan_rad, tilt_rad) for name in pair)
-    position = triangulate(left, right, left_px, right_px).position_m
-    errors = {}
-    for name in to:
-        pixel, valid = true.camera_in_rover(name, pan_rad, tilt_rad).project(target_m)
-        if valid and true.cameras[name].model.holds(pixel):
-            errors[name] = seen(believed, name, pan_rad, tilt_rad, position) - pixel
-    return errors
 
 
 def head_cameras(rig: Rig) -> Sequence[tuple[str, ...]]:

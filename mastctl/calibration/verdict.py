@@ -151,17 +151,20 @@ def _of_bench(survey: Survey, fit: BenchCalibration) -> Iterator[Reason]:
             yield Reason("bad" if drift.size_px > POINTING_GOOD_PX else "care", drift.sentence)
 
 
-def _noise(survey: Survey, fit: Calibration | BenchCalibration) -> list[Reason]:
+def _noise(survey: Survey, fit: Calibration | BenchCalibration) -> Iterator[Reason]:
     """Whether the residuals are what the stated sigmas make them."""
     if isinstance(fit, BenchCalibration) or np.isfinite(fit.chi2_probability):
-        return [_chi_square(fit), *_sigmas(survey, fit)]
+        yield _chi_square(fit)
+        yield from _sigmas(survey, fit)
+        return
     worst_px, camera = max((max(xy), name) for name, xy in fit.rms_px.items())
     sentence = f"the largest residual of the fitted images is {worst_px:.2f} px rms ({camera})"
-    if worst_px > PAPER_GOOD_PX:
-        upright = fit.mast_parameters == 4
-        why = "the mast is not upright: use --mast 6" if upright else "station and boards do not agree"
-        return [Reason("bad", f"{sentence}: {why}")]
-    return [Reason("good", f"{sentence}, within what station errors of some mm leave")]
+    if worst_px <= PAPER_GOOD_PX:
+        yield Reason("good", f"{sentence}, within what station errors of some mm leave")
+    elif fit.mast_parameters == 4:
+        yield Reason("bad", f"{sentence}: the mast is not upright: use --mast 6")
+    else:
+        yield Reason("bad", f"{sentence}: station and boards do not agree")
 
 
 def _chi_square(fit: FittedRig) -> Reason:
@@ -204,14 +207,13 @@ def order_px(survey: Survey) -> float:
     return survey.sigma.corner_px if survey.boards else survey.sigma.dot_px
 
 
-def _sigmas(survey: Survey, fit: FittedRig) -> list[Reason]:
+def _sigmas(survey: Survey, fit: FittedRig) -> Iterator[Reason]:
     """A reason for each kind of measurement whose stated sigma is not what its residuals show.
 
     Too small a sigma is a fault of the survey. Too large a one is none, once the fit takes what was found;
     unless it is so far off that the measurements may be smoothed, or copies.
     """
     wrong = [c for c in fit.components if c.wrong]
-    reasons = []
     for c in (*wrong, *(c for c in fit.components if c.generous)):
         sigma, unit, key = stated(survey, fit.images, c.kind)
         # Dots and corners come with what noise leaves of them; prints and lenses are in survey.yaml's sigma.
@@ -228,120 +230,114 @@ def _sigmas(survey: Survey, fit: FittedRig) -> list[Reason]:
         )
         if c.wrong and c.kind == PRISMS and all(other.kind != TAPES for other in wrong):
             sentence += "; tapes do not, so it may be the drawing of the prisms that is off (prism_cad_m)"
-        reasons.append(Reason(grade, sentence))
-    return [*reasons, *_uneven(survey, fit.images), *_one_station(survey, fit.components)]
+        yield Reason(grade, sentence)
+    yield from _uneven(survey, fit.images)
+    yield from _one_station(survey, fit.components)
 
 
-def _uneven(survey: Survey, images: Sequence[ImageResiduals]) -> list[Reason]:
+def _uneven(survey: Survey, images: Sequence[ImageResiduals]) -> Iterator[Reason]:
     """Images that are noisier than others of their camera: each counts with what it scatters."""
     noisy = [image for image in images if image.scatter > 1.0]
-    if not noisy:
-        return []
-    worst = max(noisy, key=lambda image: image.scatter)
-    beyond = [i for i in noisy if i.scatter * float(np.median(i.sigma_px)) > order_px(survey)]
-    sentence = (
-        f"{len(noisy)} of {len(images)} images scatter more than others of their camera, {worst.name} most, "
-        f"by {worst.scatter:.1f} times; each counts with its own sigma"
-    )
-    if len(beyond) <= MANY_UNEVEN * len(images):
-        return [Reason("good", sentence)]
-    return [Reason("care", f"{sentence}. That is many: look for motion, focus or light")]
+    if noisy:
+        worst = max(noisy, key=lambda image: image.scatter)
+        beyond = [i for i in noisy if i.scatter * float(np.median(i.sigma_px)) > order_px(survey)]
+        sentence = (
+            f"{len(noisy)} of {len(images)} images scatter more than others of their camera, {worst.name} "
+            f"most, by {worst.scatter:.1f} times; each counts with its own sigma"
+        )
+        many = len(beyond) > MANY_UNEVEN * len(images)
+        look = ". That is many: look for motion, focus or light"
+        yield Reason("care", sentence + look) if many else Reason("good", sentence)
 
 
-def _one_station(survey: Survey, components: Sequence[Component]) -> list[Reason]:
+def _one_station(survey: Survey, components: Sequence[Component]) -> Iterator[Reason]:
     """Whether prisms scatter as the tapes of the same station do: by tapes alone its sigma is found smaller
     than stated, and a wrong prism hides under the stated one."""
     by_kind = {c.kind: c for c in components if np.isfinite(c.factor)}
     tapes, prisms = by_kind.get(TAPES), by_kind.get(PRISMS)
     if tapes is None or prisms is None or not tapes.generous or prisms.factor < tapes.factor:
-        return []
-    if as_one(tapes, prisms):
-        return []
-    sigma_mm = 1e3 * survey.sigma.station_m
-    sentence = (
-        f"prisms scatter by {prisms.factor * sigma_mm:.1f} mm where the tapes of the same station do by "
-        f"{tapes.factor * sigma_mm:.1f} mm: one of them, or their drawing, is wrong; measure them again"
-    )
-    return [Reason("care", sentence)]
-
-
-def _wider(fit: Calibration) -> list[Reason]:
-    """Whether the residuals ask for a wider model than the one that was fitted."""
-    if not fit.wider:
-        return []
-    needed = [model for model in fit.wider if model.significant]
-    if not needed:
-        first = min(fit.wider, key=lambda model: model.chance)
-        sentence = (
-            f"no wider model out of {len(fit.wider)} would gain more than chance makes likely; most "
-            f"does {first.name}, {first.gain:.1f} in chi-square with {first.numbers} numbers"
+        return
+    if not as_one(tapes, prisms):
+        sigma_mm = 1e3 * survey.sigma.station_m
+        yield Reason(
+            "care",
+            f"prisms scatter by {prisms.factor * sigma_mm:.1f} mm where the tapes of the same station do by "
+            f"{tapes.factor * sigma_mm:.1f} mm: one of them, or their drawing, is wrong; measure them again",
         )
-        return [Reason("good", sentence)]
-    first, *others = needed
-    grade: Grade = "bad" if first.size_px > POINTING_GOOD_PX else "care"
-    more = "one more number" if first.numbers == 1 else f"{first.numbers} more numbers"
-    reasons = [Reason(grade, f"{more} would gain {first.gain:.0f} in chi-square: {first.sentence}")]
-    if others:
-        names = _some([f"{model.name} ({model.gain:.0f} with {model.numbers})" for model in others])
-        reasons.append(Reason("care", f"other terms that would gain, perhaps by the same cause: {names}"))
-    return reasons
 
 
-def _contradictions(fit: FittedRig) -> list[Reason]:
+def _wider(fit: Calibration) -> Iterator[Reason]:
+    """Whether the residuals ask for a wider model than the one that was fitted."""
+    needed = [model for model in fit.wider if model.significant]
+    if needed:
+        first = needed[0]
+        grade: Grade = "bad" if first.size_px > POINTING_GOOD_PX else "care"
+        more = "one more number" if first.numbers == 1 else f"{first.numbers} more numbers"
+        yield Reason(grade, f"{more} would gain {first.gain:.0f} in chi-square: {first.sentence}")
+    elif fit.wider:
+        least = min(fit.wider, key=lambda model: model.chance)
+        yield Reason(
+            "good",
+            f"no wider model out of {len(fit.wider)} would gain more than chance makes likely; most "
+            f"does {least.name}, {least.gain:.1f} in chi-square with {least.numbers} numbers",
+        )
+    if needed[1:]:
+        names = _some([f"{model.name} ({model.gain:.0f} with {model.numbers})" for model in needed[1:]])
+        yield Reason("care", f"other terms that would gain, perhaps by the same cause: {names}")
+
+
+def _contradictions(fit: FittedRig) -> Iterator[Reason]:
     """Whether placements agree with one another."""
     placements = fit.contradictions
     odd = [one for one in placements if one.significant]
     if len(placements) == 2:  # either contradicts the other
         odd = odd[:1]
+    yield from (Reason("care", one.sentence) for one in odd)
     if placements and not odd:
         first = placements[0]
-        agree = (
+        yield Reason(
+            "good",
             f"each of {len(placements)} placements says what the others say of cameras, axes and joints; "
-            f"{first.name} differs most, chi-square {first.gain:.0f} for {first.numbers} numbers"
+            f"{first.name} differs most, chi-square {first.gain:.0f} for {first.numbers} numbers",
         )
-        return [Reason("good", agree)]
-    return [Reason("care", one.sentence) for one in odd]
 
 
-def _jointly(survey: Survey, other: Calibration, fit: Calibration | CalibError | None) -> list[Reason]:
+def _jointly(survey: Survey, other: Calibration, fit: Calibration | CalibError | None) -> Iterator[Reason]:
     """What the joint fit's tests say of a survey that another method calibrated."""
-    if fit is None:
-        return []
     if isinstance(fit, CalibError):
         untested = "whether sigmas and model are right was not tested"
-        return [Reason("care", f"{untested}, since the survey cannot be fitted jointly: {fit}")]
-    reasons = [*_sigmas(survey, fit), *_wider(fit), *_contradictions(fit)]
-    left_out = {outlier.name for outlier in other.outliers}
-    if odd := [o.name for o in fit.outliers if o.kind == "image" and o.name not in left_out]:
-        used = f"{_some(odd)} would be left out as too far off, and was used: check tapes, angles and dots"
-        reasons.append(Reason("care", used))
-    return [replace(reason, sentence=f"fitted jointly, {reason.sentence}") for reason in reasons]
+        yield Reason("care", f"{untested}, since the survey cannot be fitted jointly: {fit}")
+    elif fit is not None:
+        for reason in (*_sigmas(survey, fit), *_wider(fit), *_contradictions(fit)):
+            yield replace(reason, sentence=f"fitted jointly, {reason.sentence}")
+        left_out = {outlier.name for outlier in other.outliers}
+        if odd := [o.name for o in fit.outliers if o.kind == "image" and o.name not in left_out]:
+            used = "would be left out as too far off, and was used: check tapes, angles and dots"
+            yield Reason("care", f"fitted jointly, {_some(odd)} {used}")
 
 
-def _checks(fit: Calibration | BenchCalibration) -> list[Reason]:
+def _checks(fit: Calibration | BenchCalibration) -> Iterator[Reason]:
     """Whether images that were not fitted are predicted as well as they should be."""
-    reasons = [
-        Reason("bad", f"check image {image.name} cannot show placement {image.placement}, which it names")
+    blind = [
+        f"check image {image.name} cannot show placement {image.placement}, which it names"
         for image in fit.images
         if image.purpose == "check" and not np.isfinite(image.residuals_px).all()
     ]
-    reasons += [
-        Reason(
-            "bad",
-            f"image {click.image} cannot show check point {click.point}, which was clicked in it: correct "
-            "its row in clicks.csv or the point's in station.csv",
-        )
+    blind += [
+        f"image {click.image} cannot show check point {click.point}, which was clicked in it: correct its "
+        "row in clicks.csv or the point's in station.csv"
         for click in (fit.unseen_clicks if isinstance(fit, Calibration) else ())
     ]
-    if not (fit.check_rms_px or reasons):
-        return [Reason("care", "there is no check image: nothing shows how well the result predicts")]
+    yield from (Reason("bad", sentence) for sentence in blind)
+    if not (fit.check_rms_px or blind):
+        yield Reason("care", "there is no check image: nothing shows how well the result predicts")
+        return
     for camera, size in fit.checks.items():
         sentence = (
             f"check images of {camera} are off by {size.seen_px:.2f} px rms an axis where "
             f"{size.expected_px:.2f} are expected; more than {size.most_px:.2f} would be bad"
         )
-        reasons.append(Reason("good" if size.seen_px <= size.most_px else "bad", sentence))
-    return reasons
+        yield Reason("good" if size.seen_px <= size.most_px else "bad", sentence)
 
 
 def _inexact(survey: Survey, fit: BenchCalibration) -> Iterator[Reason]:
@@ -430,25 +426,22 @@ def _left_out(fit: Calibration | BenchCalibration) -> list[Reason]:
     return reasons
 
 
-def _at_the_end(fit: Calibration) -> list[Reason]:
+def _at_the_end(fit: Calibration) -> Iterator[Reason]:
     """Whether the last images of a camera were left out: what changed before them still holds, unnoticed.
 
     Were they kept, the fit would test such a change; an image that was left out takes its evidence along.
     """
-    fitted: dict[str, list[ImageResiduals]] = {}
-    for image in fit.images:
-        if image.purpose != "check":
-            fitted.setdefault(image.camera, []).append(image)
-    reasons = []
-    for camera, images in fitted.items():
+    for camera in fit.rig.cameras:
+        images = [image for image in fit.images if image.camera == camera and image.purpose != "check"]
         last = list(takewhile(lambda image: not image.used.any(), reversed(images)))
         if 0 < len(last) < len(images):
-            left_out = f"the last {len(last)} of {len(images)} images of {camera} were left out"
-            if len(last) == 1:
-                left_out = f"the last of {len(images)} images of {camera} was left out"
-            since = f"if focus, mount or a joint changed before {last[-1].name}, the result is of before"
-            reasons.append(Reason("care", f"{left_out}: {since}; take some images again"))
-    return reasons
+            count = f"{len(last)} of {len(images)}" if len(last) > 1 else f"of {len(images)}"
+            were = "were" if len(last) > 1 else "was"
+            yield Reason(
+                "care",
+                f"the last {count} images of {camera} {were} left out: if focus, mount or a joint changed "
+                f"before {last[-1].name}, the result is of before; take some images again",
+            )
 
 
 def _some(names: Sequence[str], most: int = 4) -> str:

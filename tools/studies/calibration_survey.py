@@ -19,10 +19,11 @@ from calib.errors import CalibError
 from calib.geometry.pointing import solve
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
+from calib.geometry.stereo import triangulate
 from calib.survey.records import Sigma
 from hil_tests.support.sim_survey.plan import SurveyPlan
 from hil_tests.support.sim_survey.survey import simulate_survey
-from mastctl.calibration.landing import click, handoff_errors_px, pointing_error_px, seen
+from mastctl.calibration.landing import click, pointing_error_px, seen
 from mastctl.calibration.run import FITS, Method
 
 METHODS: tuple[Method, ...] = ("paper", "joint")
@@ -205,6 +206,31 @@ def _handoffs(true: Rig, believed: Rig, targets: int, rng: np.random.Generator) 
         if rows:
             found[name, range_m] = np.array(rows)
     return found
+
+
+def handoff_errors_px(
+    believed: Rig,
+    true: Rig,
+    pair: tuple[str, str],
+    to: tuple[str, ...],
+    pan_rad: float,
+    tilt_rad: float,
+    target_m: FloatArray,
+    left_px: FloatArray,
+    right_px: FloatArray,
+) -> Mapping[str, FloatArray]:
+    """Return by camera how far (2,), pixels, a hand-off puts a target from where it truly is.
+
+    Cameras of ``to`` whose image does not hold the target are left out. Raises CalibError as above.
+    """
+    left, right = (believed.camera_in_rover(name, pan_rad, tilt_rad) for name in pair)
+    position = triangulate(left, right, left_px, right_px).position_m
+    errors = {}
+    for name in to:
+        pixel, valid = true.camera_in_rover(name, pan_rad, tilt_rad).project(target_m)
+        if valid and true.cameras[name].model.holds(pixel):
+            errors[name] = seen(believed, name, pan_rad, tilt_rad, position) - pixel
+    return errors
 
 
 def _shared_view(
