@@ -30,7 +30,7 @@ from calib.files.mast_file import StoredRig
 from calib.geometry.covariance import stored_covariance
 from calib.geometry.rigid import FloatArray
 from mastctl.answers import MeasuredPointing, ResidualVerdict
-from mastctl.drift.samples import Expected, expected
+from mastctl.drift.samples import expected
 
 DAYS = 7
 DAY_S = 86400.0
@@ -77,13 +77,13 @@ class Evidence:
     turned: dict[str, Turned]
 
 
-def rows_of(one: Expected, off_px: FloatArray) -> FloatArray:
-    """Return (2, p + 3 c + 1) a sample's rates, turns and ``off_px`` (2,), in units of its noise.
+def rows_of(noise: FloatArray, rates: FloatArray, turned: FloatArray, off_px: FloatArray) -> FloatArray:
+    """Return (2, p + 3 c + 1) a sample's `expected` rates, turns and ``off_px`` (2,), in units of its noise.
 
     What samples say together is the sum of rowsᵀ rows.
     """
-    whole = np.column_stack([one.rates, one.turned, off_px])
-    return np.asarray(np.linalg.solve(np.linalg.cholesky(one.noise_px2), whole))
+    whole = np.column_stack([rates, turned, off_px])
+    return np.asarray(np.linalg.solve(np.linalg.cholesky(noise), whole))
 
 
 class Judge:
@@ -182,13 +182,13 @@ class Windows:
         if one["mast_digest"] != self.digest:
             return None
         try:
-            depends = expected(self._rig, self._parameters, tuple(self._rig.cameras), one)
+            noise, rates, turned = expected(self._rig, self._parameters, tuple(self._rig.cameras), one)
         except CalibError:
             return None
-        total = depends.noise_px2 + depends.rates @ self._covariance @ depends.rates.T
+        total = noise + rates @ self._covariance @ rates.T
         off = np.array(one["off_px"])
         square = float(off @ np.linalg.solve(total, off))
-        judged = Judged(one, rows_of(depends, off), np.sqrt(np.diag(total)), square)
+        judged = Judged(one, rows_of(noise, rates, turned, off), np.sqrt(np.diag(total)), square)
         self.judged.append(judged)
         return judged
 

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from calib.calibrate.drift import JOINT_SIGMA_RAD, SceneDrift, ViewShift, find_drift, seen_again
+from calib.calibrate.drift import JOINT_SIGMA_RAD, ViewShift, find_drift, seen_again
 from calib.files.mast_file import parse_rig
 from calib.geometry.rig import Rig
 from calib.matching.warp import grey
 from mastctl.client import Client, ClientError
-from mastctl.drift.pictures import Reference, ReferencePicture, add_look, read_reference
+from mastctl.drift.pictures import ReferencePicture, add_look, read_reference
 from mastctl.errors import MastctlError
 
 TURN_TIMEOUT_S = 90.0
@@ -96,30 +96,6 @@ def head_cameras(client: Client) -> tuple[Rig, list[str]]:
     return rig, [name for name, camera in rig.cameras.items() if camera.on == "head" and name in served]
 
 
-def look_again(client: Client, reference: Reference) -> SceneDrift:
-    """Take the pictures of a reference again and return what has changed.
-
-    Nothing moves before it is known that the reference can be compared with. Raises LookEnded if another mast
-    file or other cameras are in use, or the head is stopped, BadFile for a damaged reference.
-    """
-    if client.status()["mast"]["digest"] != reference.mast_digest:
-        raise LookEnded("another mast file is in use than when the reference was taken; take a new one")
-    before = reference.pictures()
-    rig, served = head_cameras(client)
-    cameras = [name for name in served if name in reference.cameras]
-    if not cameras:
-        raise LookEnded(
-            f"the reference is of {', '.join(reference.cameras) or 'no camera'}, the daemon has "
-            f"{', '.join(served) or 'no camera on the head'}; take a new one"
-        )
-    pictures, missing = take_pictures(client, reference.rests, cameras)
-    if any(one.mast_digest != reference.mast_digest for one in pictures):
-        raise LookEnded("another mast file came into use during the look; nothing was kept")
-    drift = find_drift(rig, _view_shifts(rig, before, pictures), JOINT_SIGMA_RAD)
-    gone = {name: "not configured any more" for name in reference.cameras if name not in served}
-    return replace(drift, missing=gone | missing)
-
-
 def _view_shifts(
     rig: Rig, before: Mapping[tuple[str, int], ReferencePicture], pictures: Sequence[ReferencePicture]
 ) -> list[ViewShift]:
@@ -175,17 +151,32 @@ def steering(client: Client, lease: str | None = None) -> Iterator[None]:
 def look(client: Client, folder: Path, lease: str | None = None, idle_s: float = 0.0) -> dict[str, Any]:
     """Take the images of a folder's reference again, and return the line of the look that is kept.
 
-    Raises LookEnded if the head is in use, or was within the last ``idle_s`` seconds, and where a look ends
-    early; BadFile without a reference.
+    Nothing moves before it is known that the reference can be compared with. Raises LookEnded if not, if the
+    head is in use or was within the last ``idle_s`` seconds, and where a look ends early; BadFile without a
+    reference, or for a damaged one.
     """
-    reference = read_reference(folder)
-    status = client.status()
-    state, reason, rested_s = status["state"], status["reason"], float(status["state_for_s"])
+    reference, status = read_reference(folder), client.status()
+    state, rested_s = status["state"], float(status["state_for_s"])
     if state != "ready":
-        reason = f" ({reason})" if reason else ""
+        reason = f" ({status['reason']})" if status["reason"] else ""
         raise LookEnded(f"no look now: the daemon's state is {state}{reason}, and ready is expected")
     if rested_s < idle_s:
         raise LookEnded(f"no look now: the head was used {rested_s:.0f} s ago; {idle_s:.0f} s are waited for")
+    if status["mast"]["digest"] != reference.mast_digest:
+        raise LookEnded("another mast file is in use than when the reference was taken; take a new one")
+    before = reference.pictures()
+    rig, served = head_cameras(client)
+    known = dict.fromkeys(camera for camera, _ in before)
+    cameras = [name for name in served if name in known]
+    if not cameras:
+        raise LookEnded(
+            f"the reference is of {', '.join(known) or 'no camera'}, the daemon has "
+            f"{', '.join(served) or 'no camera on the head'}; take a new one"
+        )
     with steering(client, lease):
-        drift = look_again(client, reference)
-    return add_look(folder, reference, drift)
+        pictures, missing = take_pictures(client, reference.rests, cameras)
+    if any(one.mast_digest != reference.mast_digest for one in pictures):
+        raise LookEnded("another mast file came into use during the look; nothing was kept")
+    drift = find_drift(rig, _view_shifts(rig, before, pictures), JOINT_SIGMA_RAD)
+    gone = {name: "not configured any more" for name in known if name not in served}
+    return add_look(folder, reference, replace(drift, missing=gone | missing))

@@ -52,11 +52,6 @@ class Reference:
     rests: tuple[tuple[float, float], ...]
     views: tuple[tuple[str, int, float, float], ...]
 
-    @property
-    def cameras(self) -> tuple[str, ...]:
-        """The cameras that it has images of."""
-        return tuple(dict.fromkeys(view[0] for view in self.views))
-
     def pictures(self) -> dict[tuple[str, int], ReferencePicture]:
         """Read the images, by camera and rest. Raises BadFile if one is damaged."""
         try:

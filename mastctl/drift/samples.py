@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from pydantic import TypeAdapter
@@ -24,7 +23,7 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.covariance import JOINT_NAMES, click_rates, pixel_rates
 from calib.geometry.parameters import parameter_names, parameter_part
 from calib.geometry.rig import Rig
-from calib.geometry.rigid import FloatArray, ReadOnlyArrays, tangents
+from calib.geometry.rigid import FloatArray, tangents
 from calib.geometry.stereo import triangulate
 from calib.matching.handoff import MODEL_PX, MatchedHandoff
 from drivers.interfaces import COARSE_COUNT_RAD
@@ -127,25 +126,15 @@ def handoff_samples(handoff: MatchedHandoff, mast: StoredRig, time_s: float) -> 
     return samples
 
 
-@dataclass(frozen=True, eq=False)
-class Expected(ReadOnlyArrays):
-    """A sample's ``off_px`` by what it depends on.
+def expected(
+    rig: Rig, parameters: Sequence[str], cameras: Sequence[str], one: MeasuredPointing
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return what a sample's ``off_px`` depends on.
 
-    ``noise_px2``: (2, 2) what differs from sample to sample, matches and counts. ``rates``: (2, p) by each
-    requested parameter. ``turned``: (2, 3 c) px/rad by a turn of each requested camera about x, y and z of
-    the frame that it is mounted on.
-    """
-
-    noise_px2: FloatArray
-    rates: FloatArray
-    turned: FloatArray
-
-
-def expected(rig: Rig, parameters: Sequence[str], cameras: Sequence[str], one: MeasuredPointing) -> Expected:
-    """Return what a sample depends on.
-
-    ``parameters`` (p,) are names as `calib.geometry.covariance` has them; ``cameras`` (c,) those whose turns
-    are of interest. Raises CalibError if the rig lacks a camera of it, or cannot have seen the target so.
+    First (2, 2) its noise, px²: what differs from sample to sample, matches and counts. Then (2, p) its rates
+    by each of the ``parameters``, names as `calib.geometry.covariance` has them. Last (2, 3 c) px/rad by a
+    turn of each of the ``cameras`` about x, y and z of the frame that it is mounted on. Raises CalibError if
+    the rig lacks a camera of it, or cannot have seen the target so.
     """
     pair, involved = (one["source"], one["partner"]), {one["source"], one["partner"], one["camera"]}
     if missing := involved - set(rig.cameras):
@@ -183,7 +172,7 @@ def expected(rig: Rig, parameters: Sequence[str], cameras: Sequence[str], one: M
             model = rig.cameras[camera].model
             mine = [at[f"cameras.{camera}.{part}"] for part in parameter_names(model.kind)]
             turned[:, 3 * number : 3 * number + 3] = rates[:, mine] @ _turn_rates(model)
-    return Expected(noise, rates[:, : len(parameters)], turned)
+    return noise, rates[:, : len(parameters)], turned
 
 
 def _turn_rates(model: CameraModel) -> FloatArray:

@@ -19,7 +19,7 @@ from hil_tests.mastctl.drift.histories import (
     stored_rig,
 )
 from mastctl.drift.evidence import LOG_THRESHOLD, Judge, Windows, rows_of, verdict_of
-from mastctl.drift.samples import Expected, handoff_samples
+from mastctl.drift.samples import handoff_samples
 
 CAMERAS = ("pancam_left", "navcam_left", "navcam_right")
 BUMP_RAD = 2e-3
@@ -33,7 +33,7 @@ def test_evidence_is_a_fair_bet_while_the_mast_file_holds() -> None:
     for _ in range(20_000):
         rates, turned = rng.normal(0.0, 1.0, (2, 2)), rng.normal(0.0, 200.0, (2, 3))
         off = rates @ rng.normal(0.0, 1.0, 2) + rng.normal(0.0, 1.0, 2)
-        rows = rows_of(Expected(np.eye(2), rates, turned), off)
+        rows = rows_of(np.eye(2), rates, turned, off)
         ratios.append(math.exp(judge.weigh(rows.T @ rows, 1, 0.0).log_evidence))
     assert np.mean(ratios) == pytest.approx(1.0, abs=5 * float(np.std(ratios)) / math.sqrt(len(ratios)))
 
