@@ -1,4 +1,4 @@
-"""A daemon on a simulated rover of two small Navcams, and changes of what is true that nobody tells it."""
+"""A daemon on a simulated rover of two small Navcams, and changes of what is true that it is not given."""
 
 from __future__ import annotations
 
@@ -7,13 +7,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
-from calib.geometry.rigid import rot_y
-from hil_tests.support.feature_days import ChangedRig, about
 from mastctl.config import Listen, load_config
 from mastctl.daemon import RunningDaemon
 
@@ -63,43 +59,6 @@ def truly(daemon: RunningDaemon, rig: Rig) -> Iterator[None]:
         yield
     finally:
         rover.rig = before
-
-
-def bumped(rig: Rig, camera: str, turn_rad: tuple[float, float, float]) -> Rig:
-    """A camera turned about its own place, by small angles about x, y, z of the head."""
-    return _with(rig, camera, ChangedRig(turned={camera: np.array(turn_rad)}))
-
-
-def _with(rig: Rig, camera: str, truth: ChangedRig) -> Rig:
-    one = rig.cameras[camera]
-    model = changed(one.model, camera, truth)
-    return replace(rig, cameras={**rig.cameras, camera: replace(one, model=model)})
-
-
-def slipped(rig: Rig, pan_rad: float, tilt_rad: float) -> Rig:
-    """All that hangs on the head turned against its joints, as by a horn that slipped on its shaft."""
-    # pan stands upstream of tilt: what the pan's horn turns is the mast itself
-    mast = replace(rig.mast, rotation_rad=rig.mast.rotation_rad + np.array([0.0, 0.0, pan_rad]))
-    turn = rot_y(tilt_rad)
-    cameras = {}
-    for name, one in rig.cameras.items():
-        vectors = {letter: turn @ getattr(one.model, letter) for letter in "CAHVO"}
-        cameras[name] = replace(one, model=replace(one.model, **vectors)) if one.on == "head" else one
-    return replace(rig, mast=mast, cameras=cameras)
-
-
-def changed(model: CameraModel, eye: str, truth: ChangedRig) -> CameraModel:
-    """A camera of the head as a change leaves it: turned about its own place, its focal length another."""
-    t = truth.turned.get(eye, np.zeros(3))
-    turn = about(2, t[2]) @ about(1, t[1]) @ about(0, t[0])
-    longer = 1.0 + truth.focal.get(eye, 0.0)
-    vectors = {}
-    for letter in "HV":
-        vector = getattr(model, letter)
-        along = float(model.A @ vector) * model.A
-        vectors[letter] = turn @ (along + longer * (vector - along))
-    vectors |= {"A": turn @ model.A, "O": turn @ model.O}
-    return replace(model, **vectors)
 
 
 def smaller(model: CameraModel, by: int) -> CameraModel:

@@ -83,7 +83,7 @@ LEFT = "destinations/hazcam_left"
 
 
 @pytest.mark.parametrize(
-    ("change", "place", "words"),
+    ("change", "place", "phrase"),
     [
         (changed("schema", "mastctl/handoff/2"), "line 2.schema", "mastctl/handoff/1"),
         (changed("time", "yesterday"), "line 2.time", "ISO 8601"),
@@ -104,7 +104,7 @@ LEFT = "destinations/hazcam_left"
     ],
 )  # fmt: skip
 def test_a_bad_line_is_refused_by_its_number_and_key(
-    tmp_path: Path, change: Callable[[dict[str, Any]], None], place: str, words: str
+    tmp_path: Path, change: Callable[[dict[str, Any]], None], place: str, phrase: str
 ) -> None:
     path = tmp_path / "h.jsonl"
     line = line_of(one(1))
@@ -112,4 +112,4 @@ def test_a_bad_line_is_refused_by_its_number_and_key(
     path.write_text("".join(json.dumps(each) + "\n" for each in (line_of(one(0)), line, line_of(one(2)))))
     with pytest.raises(BadFile) as caught:
         read_log(path)
-    assert caught.value.place == place and words in caught.value.reason
+    assert caught.value.place == place and phrase in caught.value.reason

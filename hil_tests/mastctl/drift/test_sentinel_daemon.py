@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
-from hil_tests.mastctl.drift.small_rover import RESTS, bumped, small_rover, truly
+from hil_tests.mastctl.drift.histories import bumped
+from hil_tests.mastctl.drift.small_rover import RESTS, small_rover, truly
 from hil_tests.waiting import until
 from mastctl.cli.main import main
 from mastctl.client import Client
@@ -26,7 +27,7 @@ Run = Callable[..., tuple[int, str, str]]
 def daemon(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
     with small_rover(repository, tmp_path_factory.mktemp("sentinel")) as made:
         folder = made.service.folder.path / "sentinel"
-        rests = [word for rest in RESTS for word in (f"--pose={rest}",)]
+        rests = [f"--pose={rest}" for rest in RESTS]
         assert main(["rig", "sentinel", "reference", "--folder", str(folder), "--url", made.url, *rests]) == 0
         yield made
 
@@ -41,9 +42,9 @@ def folder(daemon: RunningDaemon) -> Path:
 
 @pytest.fixture
 def run(daemon: RunningDaemon, folder: Path, capsys: pytest.CaptureFixture[str]) -> Run:
-    def call(*words: str, where: Path = folder) -> tuple[int, str, str]:
+    def call(*options: str, where: Path = folder) -> tuple[int, str, str]:
         capsys.readouterr()
-        code = main(["rig", "sentinel", *words, "--folder", str(where), "--url", daemon.url])
+        code = main(["rig", "sentinel", *options, "--folder", str(where), "--url", daemon.url])
         out, log = capsys.readouterr()
         return code, out.strip(), log.strip()
 
@@ -59,14 +60,14 @@ def client(daemon: RunningDaemon) -> Iterator[Client]:
             client.reset(reason="the test is over", name="ana")
 
 
-def stands(client: Client) -> tuple[float, float]:
+def angles(client: Client) -> tuple[float, float]:
     joints = client.status()["joints"]
     assert joints is not None
     return joints["pan_rad"], joints["tilt_rad"]
 
 
 def undated(sentence: str) -> str:
-    """Return a finding without since how many minutes it stands, which grow while the test runs."""
+    """Return a finding without its age, which grows while the test runs."""
     return sentence.partition(", since ")[0]
 
 
@@ -76,17 +77,17 @@ def test_a_bumped_camera_is_seen_by_two_looks_and_reported_everywhere(
     what = "the images moved by up to "
     rover = daemon.service.hardware.simulation
     assert rover is not None
-    before = stands(client)
+    before = angles(client)
     with truly(daemon, bumped(rover.rig, "navcam_left", (0.0, 1.8e-3, 0.0))):
-        code, said, _ = run("look")
-        assert (code, said.startswith(what)) == (0, True), said
-        assert "seen once" in said
-        code, said, _ = run("look")
-    assert (code, said.startswith(what)) == (1, True), said
-    assert " sigma" in said and "since " in said
-    assert stands(client) == pytest.approx(before, abs=1e-3)
+        code, shown, _ = run("look")
+        assert (code, shown.startswith(what)) == (0, True), shown
+        assert "seen once" in shown
+        code, shown, _ = run("look")
+    assert (code, shown.startswith(what)) == (1, True), shown
+    assert " sigma" in shown and "since " in shown
+    assert angles(client) == pytest.approx(before, abs=1e-3)
     until(
-        lambda: undated(client.request("GET", "/sentinel")["sentence"]) == undated(said),
+        lambda: undated(client.request("GET", "/sentinel")["sentence"]) == undated(shown),
         "the daemon has read the look",
     )
     answer = client.request("GET", "/sentinel")
@@ -149,11 +150,11 @@ class Meddling(Client):
         self._meddle = meddle
         self._pictures = 0
 
-    def snapshot(self, *words: Any, **options: Any) -> Any:
+    def snapshot(self, *args: Any, **options: Any) -> Any:
         self._pictures += 1
         if self._pictures == 2:
             self._meddle()
-        return super().snapshot(*words, **options)
+        return super().snapshot(*args, **options)
 
 
 def looked(daemon: RunningDaemon, folder: Path, meddle: Callable[[], object], idle_s: float = 0.0) -> str:
@@ -198,11 +199,11 @@ def test_after_a_stop_in_the_middle_looks_move_nothing_more(
 
     def press() -> None:
         getattr(client, stop)()
-        at.append(stands(client))
+        at.append(angles(client))
 
     by = {"stop": "ana", "estop": "an emergency stop (ana)"}[stop]
     assert looked(daemon, folder, press) == f"the head was stopped by {by}; nothing was kept"
-    assert stands(client) == at[0]
+    assert angles(client) == at[0]
     state = {"stop": "holding", "estop": "stopped"}[stop]
     assert looked(daemon, folder, lambda: None).startswith(f"no look now: the daemon's state is {state}")
-    assert stands(client) == at[0]
+    assert angles(client) == at[0]

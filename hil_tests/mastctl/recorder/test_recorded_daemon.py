@@ -1,4 +1,4 @@
-"""A daemon that records itself: what its commands did stands in the file; routes, client, command line."""
+"""A daemon that records itself: its commands and results are in the file; routes, client, command line."""
 
 from __future__ import annotations
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import json
 import os
-import shutil
 import threading
 import time
 from collections.abc import Callable
@@ -263,19 +262,6 @@ def test_the_free_space_of_others_stays_the_oldest_segment_goes_first(
     until(lambda: not one.recorder.faults(), "it goes on")
     one.recorder.close()
     assert all(McapContents is not None and list(read_items(path)) for path in files(tmp_path))
-
-
-def test_a_folder_that_goes_while_it_is_recorded_is_a_fault(tmp_path: Path) -> None:
-    one = Recording(tmp_path / "recordings", ring_s=0.0)
-    one.recorder.start_run("rock")
-    one.publish("command", "1", {"number": 1})
-    one.written()
-    shutil.rmtree(tmp_path / "recordings")
-    one.publish("command", "2", {"number": 2})
-    until(lambda: one.recorder.faults(), "it says so")
-    (fault,) = one.recorder.faults()
-    assert fault.code == "unwritable" and "No such file or directory; the run" in fault.message
-    one.recorder.close()
 
 
 def test_a_run_ends_at_its_size_and_says_so(tmp_path: Path) -> None:
