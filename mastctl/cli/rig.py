@@ -16,7 +16,7 @@ from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, check_fold
 if TYPE_CHECKING:
     from drivers.registry import ProbedHead
     from mastctl.answers import Status
-    from mastctl.conform.rig import Check, CheckOutcome
+    from mastctl.conform.rig import Check
 
 HEADS = "ptu_d46_70|dynamixel_x|ph42"
 OUTCOMES = {"passed": "ok", "failed": "FAILED", "skipped": "-"}
@@ -272,10 +272,9 @@ def _conform(args: argparse.Namespace) -> Answer:
     with rig_under_test(args.url, args.reach) as rig:
         motion = _may_move(args, checks, bool(rig.began.get("simulated")))
         report = check_rig(rig, checks, motion, (lambda outcome: None) if args.json else _show)
-    counts = ", ".join(f"{count} {state}" for state, count in report.counts.items())
-    document = report.as_json()
-    verdict = "conforms" if document["conforms"] else "does not conform"
-    return Answer(document, f"daemon {report.subject} {verdict}: {counts}", int(not document["conforms"]))
+    counts = ", ".join(f"{report[state]} {state}" for state in OUTCOMES)
+    verdict = "conforms" if report["conforms"] else "does not conform"
+    return Answer(report, f"daemon {report['subject']} {verdict}: {counts}", int(not report["conforms"]))
 
 
 def _may_move(args: argparse.Namespace, checks: Sequence[Check], simulated: bool) -> bool:
@@ -299,10 +298,10 @@ def _chosen(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
     return [c for c in checks if c.name in names or c.name.partition(".")[0] in names]
 
 
-def _show(outcome: CheckOutcome) -> None:
+def _show(outcome: dict[str, Any]) -> None:
     """Show a check that has ended, in one line."""
-    promise = outcome.promise if outcome.state == "passed" else ""
-    measured = f" ({outcome.message})" if promise and outcome.message else outcome.message
+    promise = outcome["promise"] if outcome["state"] == "passed" else ""
+    measured = f" ({outcome['message']})" if promise and outcome["message"] else outcome["message"]
     line = output.one_line(f"{promise}{measured}")
-    sys.stdout.write(f"{OUTCOMES[outcome.state]:6} {outcome.name:22} {line}\n")
+    sys.stdout.write(f"{OUTCOMES[outcome['state']]:6} {outcome['name']:22} {line}\n")
     sys.stdout.flush()

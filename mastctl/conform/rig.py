@@ -7,9 +7,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import yaml
 
@@ -20,8 +20,7 @@ from mastctl.errors import NotNow
 log = logging.getLogger(__name__)
 
 Angles = tuple[float, float]
-State = Literal["passed", "failed", "skipped"]
-STATES: tuple[State, ...] = ("passed", "failed", "skipped")
+STATES = ("passed", "failed", "skipped")
 
 ENDED = ("done", "failed", "stopped")
 ARRIVED_RAD = 0.006  # where the service lets a move end
@@ -43,46 +42,6 @@ class Check:
     promise: str
     moves: bool
     test: Callable[[RigTrial], str | None]
-
-
-@dataclass(frozen=True)
-class CheckOutcome:
-    """The outcome of a check; ``message`` says what was measured, what is wrong, or why it was skipped."""
-
-    name: str
-    promise: str
-    state: State
-    message: str
-    duration_s: float
-
-
-@dataclass(frozen=True)
-class ConformReport:
-    """The outcomes of the checks of one rig; ``subject`` is the daemon's address.
-
-    ``may_move`` is why the head may still move, one sentence; empty when it was stopped, or never moved.
-    """
-
-    subject: str
-    outcomes: Sequence[CheckOutcome]
-    may_move: str = ""
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """How many passed, failed and were skipped."""
-        states = [outcome.state for outcome in self.outcomes]
-        return {state: states.count(state) for state in STATES}
-
-    def as_json(self) -> dict[str, Any]:
-        """Return it as JSON; it ``conforms`` if none failed, one at least passed, and the head is at rest."""
-        counts = self.counts
-        return {
-            "subject": self.subject,
-            "conforms": counts["failed"] == 0 < counts["passed"] and not self.may_move,
-            **counts,
-            "may_move": self.may_move,
-            "checks": [asdict(outcome) for outcome in self.outcomes],
-        }
 
 
 class RigTrial:
@@ -208,32 +167,42 @@ def check_rig(
     trial: RigTrial,
     checks: Sequence[Check],
     motion: bool,
-    report: Callable[[CheckOutcome], object] = lambda outcome: None,
-) -> ConformReport:
-    """Run checks on a rig. However they end, by Ctrl-C too, a head that was moved is stopped.
+    report: Callable[[dict[str, Any]], object] = lambda outcome: None,
+) -> dict[str, Any]:
+    """Run checks on a rig and return the report, as JSON; ``report`` is called with each outcome.
 
-    Without ``motion`` checks that move the head are skipped; ``report`` is called with each outcome.
+    A check's ``message`` says what was measured, what is wrong, or why it was skipped. The rig ``conforms``
+    if none failed, one at least passed, and the head is at rest; ``may_move`` is why it may still move, one
+    sentence. However the checks end, by Ctrl-C too, a head that was moved is stopped. Without ``motion``
+    those that move it are skipped.
     """
-    outcomes: list[CheckOutcome] = []
+    outcomes: list[dict[str, Any]] = []
     lost = left = ""
     try:
         for check in checks:
             began_s, gone = time.monotonic(), False
-            state: State = "skipped"
-            message = f"not tried after {lost}" if lost else "the head may not move"
+            state, message = "skipped", f"not tried after {lost}" if lost else "the head may not move"
             if not lost and (motion or not check.moves):
                 state, message, gone = _tried(check, trial)
             lost = check.name if gone else lost
-            duration_s = time.monotonic() - began_s
-            outcomes.append(CheckOutcome(check.name, check.promise, state, message, duration_s))
+            known = {"name": check.name, "promise": check.promise, "state": state, "message": message}
+            outcomes.append({**known, "duration_s": time.monotonic() - began_s})
             report(outcomes[-1])
     finally:
         if motion and any(check.moves for check in checks):
             left = _stopped_at_the_end(trial.client.url)
-    return ConformReport(trial.client.url, outcomes, left)
+    states = [outcome["state"] for outcome in outcomes]
+    counts = {state: states.count(state) for state in STATES}
+    return {
+        "subject": trial.client.url,
+        "conforms": counts["failed"] == 0 < counts["passed"] and not left,
+        **counts,
+        "may_move": left,
+        "checks": outcomes,
+    }
 
 
-def _tried(check: Check, trial: RigTrial) -> tuple[State, str, bool]:
+def _tried(check: Check, trial: RigTrial) -> tuple[str, str, bool]:
     """Run one check; return its state and message, and whether the daemon does not answer any more."""
     try:
         return "passed", check.test(trial) or "", False

@@ -18,6 +18,7 @@ import os
 import sys
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
@@ -25,7 +26,6 @@ from typing import IO, Any
 from calib.errors import BadFile
 from calib.files.mast_file import load_rig, save_rig
 from calib.geometry.cahvor import CameraModel
-from calib.geometry.rig import Rig
 from drivers.errors import BadOptions
 from drivers.sim.rover import RoverModel
 from mastctl.config import Config, Listen, load_config, not_simulated
@@ -85,18 +85,19 @@ class Daemons:
         return self._rover.true_joints(self._do_now())
 
     def _do_point(self, frame_id: str, pixel_px: list[float]) -> list[float] | None:
-        try:
-            point = self._rover.true_point(*_named(frame_id), pixel_px)
-        except LookupError as error:
-            raise NotKnown("frame_unknown", str(error)) from None
+        point = self._in_frame(self._rover.true_point, frame_id, pixel_px)
         return None if point is None else point.tolist()
 
     def _do_pixel(self, frame_id: str, position_m: list[float]) -> list[float] | None:
-        try:
-            pixel: list[float] = self._rover.true_pixel(*_named(frame_id), position_m).tolist()
-        except LookupError as error:
-            raise NotKnown("frame_unknown", str(error)) from None
+        pixel: list[float] = self._in_frame(self._rover.true_pixel, frame_id, position_m).tolist()
         return pixel if all(map(math.isfinite, pixel)) else None
+
+    @staticmethod
+    def _in_frame(truth: Callable[[str, int, list[float]], Any], frame_id: str, numbers: list[float]) -> Any:
+        try:
+            return truth(*camera_and_sequence(frame_id), numbers)
+        except (LookupError, ValueError) as error:
+            raise NotKnown("frame_unknown", str(error)) from None
 
     def _do_pose(self) -> tuple[list[float], list[float]]:
         pose = RoverPose(self._rover.site_from_rover).as_json(0.0)
@@ -150,14 +151,6 @@ def config_for_a_test(
     return config if picture_width_px is None else with_width(config, picture_width_px, folder)
 
 
-def _named(frame_id: str) -> tuple[str, int]:
-    """The camera and the sequence of a frame. Raises NotKnown."""
-    try:
-        return camera_and_sequence(frame_id)
-    except ValueError as error:
-        raise NotKnown("frame_unknown", str(error)) from None
-
-
 NARROWEST_PX = 64
 WIDEST_PX = 4096
 
@@ -165,11 +158,15 @@ WIDEST_PX = 4096
 def with_width(config: Config, width_px: int, folder: Path) -> Config:
     """Return a configuration whose cameras, as believed and as they truly are, have pictures of a width.
 
-    They see what they saw before, in as many more or fewer pixels. Both mast files are written into
-    ``folder``. Raises BadOptions for a width that is none, or a true rig that cannot be read, and BadFile for
-    a mast file that cannot be read.
+    They see what they saw before, in as many more or fewer pixels; residuals and covariance were of other
+    pixels, and go. Both mast files are written into ``folder``. Raises BadOptions for a width that is none,
+    or a true rig that cannot be read, and BadFile for a mast file that cannot be read.
     """
-    if isinstance(width_px, bool) or not isinstance(width_px, int) or not 64 <= width_px <= WIDEST_PX:
+    if (
+        isinstance(width_px, bool)
+        or not isinstance(width_px, int)
+        or not NARROWEST_PX <= width_px <= WIDEST_PX
+    ):
         raise BadOptions(
             f"picture_width_px is {width_px!r}, expected a whole number from {NARROWEST_PX} to {WIDEST_PX}"
         )
@@ -178,22 +175,17 @@ def with_width(config: Config, width_px: int, folder: Path) -> Config:
     if not isinstance(true_rig, str):
         return config  # the simulation says what is wrong
     try:
-        truth = load_rig(hardware.folder / true_rig).rig
+        rigs = {"true_rig.yaml": load_rig(hardware.folder / true_rig).rig}
     except BadFile as error:
         raise BadOptions(f"simulation.rover: {error}") from None
-    belief = load_rig(config.mast_file).rig
-    save_rig(_narrowed(truth, width_px), folder / "true_rig.yaml")
-    save_rig(_narrowed(belief, width_px), folder / "mast.yaml")
+    rigs["mast.yaml"] = load_rig(config.mast_file).rig
+    for name, rig in rigs.items():
+        cameras = {
+            camera: replace(one, model=resized(one.model, width_px)) for camera, one in rig.cameras.items()
+        }
+        save_rig(replace(rig, cameras=cameras, fit={}), folder / name)
     simulation = {**hardware.simulation, "rover": str(folder / "true_rig.yaml")}
     return replace(config, mast_file=folder / "mast.yaml", hardware=replace(hardware, simulation=simulation))
-
-
-def _narrowed(rig: Rig, width_px: int) -> Rig:
-    """A rig with pictures of a width; without residuals and covariance: those were of other pixels."""
-    cameras = {
-        name: replace(camera, model=resized(camera.model, width_px)) for name, camera in rig.cameras.items()
-    }
-    return replace(rig, cameras=cameras, fit={})
 
 
 def resized(model: CameraModel, width_px: int) -> CameraModel:

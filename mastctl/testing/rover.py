@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import select
@@ -11,8 +10,8 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 Request = Callable[..., Any]
@@ -35,7 +34,7 @@ class RoverError(Exception):
         super().__init__(message)
 
 
-class SetFault:
+class SetFault(AbstractContextManager["SetFault"]):
     """A fault that is set. Leaving it as a context, or `clear`, takes it back."""
 
     def __init__(self, request: Request, device: str, word: str) -> None:
@@ -46,15 +45,7 @@ class SetFault:
         """Take the fault back; nothing if it is over already."""
         self._request("clear_fault", device=self.device, word=self.word)
 
-    def __enter__(self) -> SetFault:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *ignored: object) -> None:
         self.clear()
 
 
@@ -202,7 +193,7 @@ class RoverProcess:
         process = self._process
         for stream in (process.stdin, process.stdout):
             if stream is not None:
-                with contextlib.suppress(OSError):
+                with suppress(OSError):
                     stream.close()  # its sign to end
         try:
             process.wait(END_S)

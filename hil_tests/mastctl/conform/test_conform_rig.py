@@ -48,7 +48,7 @@ def states(url: str, *names: str) -> dict[str, str]:
     """What became of some checks."""
     checks = [check for check in RIG if check.name in names]
     with rig_under_test(url, 0.3) as rig:
-        return {outcome.name: outcome.state for outcome in check_rig(rig, checks, True).outcomes}
+        return {outcome["name"]: outcome["state"] for outcome in check_rig(rig, checks, True)["checks"]}
 
 
 def edited(
@@ -225,11 +225,11 @@ def test_without_motion_nothing_moves_and_the_rest_is_asked(proxy: Proxy, daemon
     with Client(daemon_url) as client:
         before, known = client.status()["joints"]["pan_rad"], client.operations()
         with rig_under_test(proxy.url, 0.3) as daemon:
-            outcomes = check_rig(daemon, RIG, False).outcomes
+            outcomes = check_rig(daemon, RIG, False)["checks"]
         assert client.status()["joints"]["pan_rad"] == before and client.operations() == known
     moving = {check.name for check in RIG if check.moves}
-    assert {outcome.name for outcome in outcomes if outcome.state == "skipped"} == moving
-    assert not [outcome for outcome in outcomes if outcome.state == "failed"]
+    assert {outcome["name"] for outcome in outcomes if outcome["state"] == "skipped"} == moving
+    assert not [outcome for outcome in outcomes if outcome["state"] == "failed"]
 
 
 def moving_now(told: Passing) -> bool:
@@ -289,7 +289,7 @@ def test_a_stop_at_the_end_that_is_not_confirmed_is_said(proxy: Proxy) -> None:
     checks = [check for check in RIG if check.name == "motion.home"]
     with rig_under_test(proxy.url, 0.3) as daemon:
         report = check_rig(daemon, checks, True)
-    assert "did not confirm" in report.may_move and not report.as_json()["conforms"]
+    assert "did not confirm" in report["may_move"] and not report["conforms"]
 
 
 def refusal(capsys: pytest.CaptureFixture[str]) -> str:

@@ -23,9 +23,9 @@ def test_the_simulated_rover_conforms_and_a_click_lands() -> None:
         RunningDaemon(replace(config, hardware=hardware, listen=listen)) as daemon,
         rig_under_test(daemon.url, 0.3) as under_test,
     ):
-        outcomes = check_rig(under_test, RIG, True).outcomes
-    assert [outcome for outcome in outcomes if outcome.state == "failed"] == []
-    assert [outcome for outcome in outcomes if outcome.state == "skipped"] == []
+        outcomes = check_rig(under_test, RIG, True)["checks"]
+    assert [outcome for outcome in outcomes if outcome["state"] == "failed"] == []
+    assert [outcome for outcome in outcomes if outcome["state"] == "skipped"] == []
 
 
 def test_a_simulated_head_and_camera_keep_their_promises(tmp_path: Path) -> None:
