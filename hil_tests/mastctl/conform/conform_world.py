@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from calib.files.mast_file import save_rig
-from drivers.clock import SystemClock
+from drivers.clock import Clock, SystemClock
 from drivers.errors import NoFreshFrame, NoReply
 from drivers.faults import FaultPanel
 from drivers.interfaces import Camera, CameraInfo, CameraSetting, Frame
@@ -41,10 +41,12 @@ CRAWLING_RAD_PER_S = 0.001
 """Nothing that a check asks for is reached within a minute: what is done meanwhile is done in the move."""
 
 
-def open_head(low_rad: float = -2.0, high_rad: float = 2.0, name: str = "") -> SimulatedPanTilt:
+def open_head(
+    low_rad: float = -2.0, high_rad: float = 2.0, name: str = "", clock: Clock | None = None
+) -> SimulatedPanTilt:
     """A head in memory; ``name`` tells it from those of other daemons in this process."""
     axis = AxisSettings(COUNT_RAD, 0.0, low_rad, high_rad, FASTEST_RAD_PER_S, 20.0)
-    clock = SystemClock()
+    clock = clock or SystemClock()
     return SimulatedPanTilt(HeadModel("in memory", axis, axis), clock, FaultPanel(clock.now_s, ()))
 
 

@@ -12,8 +12,10 @@ from typing import Any
 
 import pytest
 
+from drivers.clock import Clock, SystemClock
 from drivers.errors import DriverError, NoReply
 from drivers.interfaces import Reading
+from drivers.simulation_clock import SimulationClock
 from hil_tests.mastctl.conform.conform_world import HERE, accepted, open_head
 from mastctl.conform.device_checks import SubjectLost
 from mastctl.testing.drivers import test_head as suite
@@ -28,8 +30,8 @@ TESTS = {one for name, one in vars(suite).items() if name.startswith("test_")}
 class Right:
     """A right head, to be broken."""
 
-    def __init__(self) -> None:
-        self.right = open_head()
+    def __init__(self, clock: Clock) -> None:
+        self.clock, self.right = clock, open_head(clock=clock)
         self.goal = (0.0, 0.0)
 
     def read(self) -> Reading:
@@ -72,7 +74,7 @@ def waits(head: Right, pan: float, tilt: float, speed: float | None) -> None:
     """A move that comes back when the head is there."""
     Right.move(head, pan, tilt, speed)
     while head.right.read().moving:
-        time.sleep(0.005)
+        head.clock.sleep(0.005)
 
 
 def clipped(head: Right, pan: float, tilt: float, speed: float | None) -> Any:
@@ -112,7 +114,7 @@ class Creeps(Right):
     def stop(self) -> None:
         super().stop()
         while self.right.read().moving:
-            time.sleep(0.002)
+            self.clock.sleep(0.002)
         reading = self.right.read()
         self.right.move(reading.pan_rad + 0.2, reading.tilt_rad, 0.1)
 
@@ -123,14 +125,14 @@ class Creeps(Right):
 class StopWaits(Right):
     """A stop waits for the lock that a move holds until it is acknowledged."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, clock: Clock) -> None:
+        super().__init__(clock)
         self.lock = threading.Lock()
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
         with self.lock:
             super().move(pan_rad, tilt_rad, speed_rad_per_s)
-            time.sleep(0.8)
+            self.clock.sleep(0.8)
 
     def stop(self) -> None:
         with self.lock:
@@ -140,15 +142,15 @@ class StopWaits(Right):
 class OneAtATime(Right):
     """Refuses a call beside another."""
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, clock: Clock) -> None:
+        super().__init__(clock)
         self.busy = threading.Lock()
 
     def read(self) -> Reading:
         if not self.busy.acquire(blocking=False):
             raise DriverError("the port is busy")
         try:
-            time.sleep(0.01)
+            self.clock.sleep(0.01)
             return super().read()
         finally:
             self.busy.release()
@@ -156,7 +158,7 @@ class OneAtATime(Right):
 
 class Slow(Right):
     def read(self) -> Reading:
-        time.sleep(0.6)
+        self.clock.sleep(0.6)
         return super().read()
 
 
@@ -203,26 +205,33 @@ BROKEN: list[tuple[str, Test, type[Right]]] = [
 ]  # fmt: skip
 
 
-def trial(head: Any, **known: Any) -> HeadTrial:
-    return HeadTrial(head, BOX, 0.8, limits_rad=LIMITS, **known)
+def tried(test: Test, kind: Callable[[Clock], Any], **known: Any) -> None:
+    """Run a test on a head, on a turned clock unless threads have to meet."""
+    clock = SystemClock() if kind in (StopWaits, OneAtATime) else SimulationClock(start_s=1000.0)
+    test(HeadTrial(kind(clock), BOX, 0.8, limits_rad=LIMITS, clock=clock, **known))
 
 
 @pytest.mark.parametrize(("test", "kind"), [one[1:] for one in BROKEN], ids=[one[0] for one in BROKEN])
 def test_a_broken_head_is_found_by_the_test_meant_for_it(test: Test, kind: type[Right]) -> None:
     with pytest.raises((AssertionError, DriverError)) as failed:
-        test(trial(kind()))
+        tried(test, kind)
     assert "\n" not in str(failed.value)
 
 
 def test_a_move_that_a_busy_machine_delays_is_no_fault_of_the_driver() -> None:
     delayed = iter([False, False, False, True, False])  # the first three ways are too short to tell
-    kind = moves(lambda head, p, t, s: waits(head, p, t, s) if next(delayed) else (p, t, s))
-    suite.test_move(trial(kind()))
+    tried(suite.test_move, moves(lambda head, p, t, s: waits(head, p, t, s) if next(delayed) else (p, t, s)))
 
 
 def test_a_right_head_is_closed_and_opened_again() -> None:
     """The other tests are passed by every head of test_head_contract."""
-    suite.test_close(trial(Right(), open_again=Right))
+    clocks: list[Clock] = []
+
+    def first(clock: Clock) -> Right:
+        clocks.append(clock)
+        return Right(clock)
+
+    tried(suite.test_close, first, open_again=lambda: Right(clocks[0]))
 
 
 def test_there_is_a_broken_head_for_every_test() -> None:
@@ -239,7 +248,7 @@ def test_a_head_that_hangs_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
             return super().read()
 
     with pytest.raises(SubjectLost, match="has not come back"):
-        suite.test_reading(trial(Hangs()))
+        tried(suite.test_reading, Hangs)
     go.set()
 
 
@@ -273,7 +282,6 @@ def test_the_suite_takes_a_driver_by_its_name_and_refuses_wrong_use(tmp_path: Pa
         ((*words, "--limits", "1", "-1", "-1", "1"), "the lower angle first is expected", 4),
         (("--motion",), "--head DRIVER, --camera DRIVER or --rig FILE is expected", 4),
         (("--head", "no.such:thing", "--motion"), "no.such", 1),
-        (("--head", f"{HERE}:open_head", "--options", "[1]"), "a JSON object is expected", 4),
     ):
         done = accepted(tmp_path, *wrong)
         assert done.returncode == code and message in done.stdout + done.stderr, done.stdout + done.stderr
