@@ -25,7 +25,6 @@ from mastctl.cli.output import (
     check_file,
     check_folder,
     tables_at,
-    tables_of,
     unusable,
 )
 
@@ -127,7 +126,7 @@ def _refine(args: argparse.Namespace) -> Answer:
     kept = None if previous is None else str(previous)
     document["mast_file"] = {"path": str(saved.path), "digest": saved.digest, "previous": kept}
     after = f"{mast.path} is as it was; a daemon uses the new one after 'mastctl rig mast use'"
-    return Answer(document, [*tables_of(document["mast_file"], "proposed mast file"), *shown, after])
+    return Answer(document, [*tables_at(document["mast_file"], "", "proposed mast file"), *shown, after])
 
 
 def _from_survey(args: argparse.Namespace) -> Answer:

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli.options import command, option, positive_number
-from mastctl.cli.output import Answer, Shown, WrongUse, check_file, tables_at, tables_of, tell
+from mastctl.cli.output import Answer, Shown, WrongUse, check_file, tables_at, tell
 
 if TYPE_CHECKING:
     from drivers.hardware import HardwareSettings
@@ -51,7 +51,7 @@ def camera_list(args: argparse.Namespace) -> Answer:
             found[driver.bench.key], sentences = driver.bench.table()
             refused += sentences
     shown: list[str | Shown] = [
-        *tables_of({key: rows for key, rows in found.items() if rows}, "connected"),
+        *tables_at({key: rows for key, rows in found.items() if rows}, "", "connected"),
         *refused,
     ]
     return Answer({**found, "refused": refused}, shown or ["no camera is connected"])
@@ -78,7 +78,9 @@ def camera_check(args: argparse.Namespace) -> Answer:
         found["problems"] += [problem.message for problem in getattr(camera, "problems", ())]
     shown = {key: value for key, value in found.items() if key != "problems"}
     problems = [f"problem: {one}" for one in found["problems"]] or ["no problem was found"]
-    return Answer(found, [*tables_of(shown, f"check of {args.camera}"), *problems], int(not found["frames"]))
+    return Answer(
+        found, [*tables_at(shown, "", f"check of {args.camera}"), *problems], int(not found["frames"])
+    )
 
 
 @command(

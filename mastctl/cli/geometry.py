@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli.options import command, option, positive_number
-from mastctl.cli.output import Answer, CommandError, WrongUse, check_file, tables_at, tables_of, tell
+from mastctl.cli.output import Answer, CommandError, WrongUse, check_file, tables_at, tell
 
 if TYPE_CHECKING:
     import numpy as np
@@ -292,7 +292,7 @@ def camera_convert(args: argparse.Namespace) -> Answer:
     document: dict[str, Any] = {"out": str(done.path), "format": done.format, "frame": frame}
     document |= {"lost": list(done.lost), "notes": notes} | ({"cameras": errors} if errors else {})
     line = f"{done.path}: {done.format}, frame '{frame}'"
-    return Answer(document, [line, *tables_of(errors, "errors"), *notes, *done.lost])
+    return Answer(document, [line, *tables_at(errors, "", "errors"), *notes, *done.lost])
 
 
 def _chosen_model(args: argparse.Namespace) -> CameraModel:

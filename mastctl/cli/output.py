@@ -77,11 +77,29 @@ def show(args: argparse.Namespace, answer: Answer) -> int:
 
 
 def tables_at(document: Mapping[str, Any], keys: str = "", title: str = "") -> list[Shown]:
-    """Return a record as tables: its values at these keys as of `chosen`, or all of it."""
+    """Return a record as tables: its values by their keys, and each of its lists of records by itself.
+
+    ``keys`` are those of `chosen`; all of it without them.
+    """
     from mastctl.as_json import as_json
 
     plain = as_json(document)
-    return tables_of(chosen(plain, keys) if keys else plain, title)
+    plain = chosen(plain, keys) if keys else plain
+    if len(plain) == 1 and not title:
+        [(key, value)] = plain.items()
+        if isinstance(value, Mapping):
+            return tables_at(value, "", key)
+    lists = {
+        key: value for key, value in plain.items()
+        if isinstance(value, list) and value and all(isinstance(one, Mapping) for one in value)
+    }  # fmt: skip
+    rows = [row for key, value in plain.items() if key not in lists for row in _rows(key, value)]
+    found = [Shown(title, ("", ""), rows)] if rows else []
+    for key, records in lists.items():
+        columns = list(dict.fromkeys(name for record in records for name in record))
+        cells = [[cell(record.get(name)) for name in columns] for record in records]
+        found.append(Shown(key, [_plain(name) for name in columns], cells))
+    return found
 
 
 def chosen(document: Mapping[str, Any], keys: str) -> dict[str, Any]:
@@ -105,26 +123,6 @@ def chosen(document: Mapping[str, Any], keys: str) -> dict[str, Any]:
         elif not rest and value not in (None, "", [], {}):
             found[name] = value
     return {name: value for name, value in found.items() if value not in ([], {})}
-
-
-def tables_of(document: Mapping[str, Any], title: str = "") -> list[Shown]:
-    """Return any record as tables: its values by their keys, and each of its lists of records by itself."""
-    if len(document) == 1 and not title:
-        [(key, value)] = document.items()
-        if isinstance(value, Mapping):
-            return tables_of(value, key)
-    lists = {key: value for key, value in document.items() if _is_rows(value)}
-    rows = [row for key, value in document.items() if key not in lists for row in _rows(key, value)]
-    found = [Shown(title, ("", ""), rows)] if rows else []
-    for key, records in lists.items():
-        columns = list(dict.fromkeys(name for record in records for name in record))
-        cells = [[cell(record.get(name)) for name in columns] for record in records]
-        found.append(Shown(key, [_plain(name) for name in columns], cells))
-    return found
-
-
-def _is_rows(value: Any) -> bool:
-    return isinstance(value, (list, tuple)) and bool(value) and all(isinstance(one, Mapping) for one in value)
 
 
 def _rows(key: str, value: Any) -> Iterable[tuple[str, str]]:

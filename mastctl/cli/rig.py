@@ -7,6 +7,7 @@ import json
 import re
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
@@ -160,22 +161,13 @@ def _new_simulated(args: argparse.Namespace) -> Answer:
     import numpy as np
 
     from calib.files.mast_file import load_rig
-    from drivers.hardware import DeviceSettings, HardwareSettings, clock_for
-    from drivers.sim.heads import DEFAULT_HEADS, check_head, head_settings
-    from mastctl.packaged import driver_of_hardware
+    from drivers.sim.settings import simulation_settings
     from mastctl.setup.simulated_rig import RigNumbers, built_rig, check_free, write_rover
 
     simulation: dict[str, Any] = {"seed": args.seed, "samples": 2}
-    simulation |= {
-        key: getattr(args, key) for key in ("head", "wire", "speed") if getattr(args, key) is not None
-    }
-    clock_for(
-        HardwareSettings(DeviceSettings(driver_of_hardware("simulated")), {}, simulation)
-    )  # or refuses speed
-    if args.wire is not None:
-        if args.wire not in DEFAULT_HEADS:
-            raise WrongUse(f"--wire is '{args.wire}', expected one of {', '.join(DEFAULT_HEADS)}")
-        check_head(args.wire, head_settings(args.head or DEFAULT_HEADS[args.wire]))
+    given = {key: getattr(args, key) for key in ("head", "wire", "speed")}
+    simulation |= {key: value for key, value in given.items() if value is not None}
+    simulation_settings({"rover": "true_rig.yaml", **simulation}, args.folder)  # or refuses it
     check_folder(args.folder, "FOLDER")
     check_free(args.folder)
     if args.mast_file is not None:
@@ -205,9 +197,15 @@ def _new_simulated(args: argparse.Namespace) -> Answer:
     example="--config rover.yaml",
 )
 def _doctor(args: argparse.Namespace) -> Answer:
+    from mastctl.client import Client, ClientError
     from mastctl.setup.doctor import examine, next_command
 
-    found = list(examine(args.config, _status))
+    def status_at(url: str) -> Status | None:
+        with suppress(ClientError), Client(url) as client:
+            return client.status()
+        return None
+
+    found = list(examine(args.config, status_at))
     bad, unsure = (sum(one.level == level for one in found) for level in ("bad", "unsure"))
     following = next_command(args.config, found)
     document = {
@@ -222,26 +220,14 @@ def _doctor(args: argparse.Namespace) -> Answer:
     return Answer(document, lines, 1 if bad else 0)
 
 
-def _status(url: str) -> Status | None:
-    """The status of a daemon, if one answers."""
-    from mastctl.client import Client, ClientError
-
-    try:
-        with Client(url) as client:
-            return client.status()
-    except ClientError:
-        return None
-
-
 @command("schema", option("[NAME]", "config, mast, board ... (default: their list)"), example="config")
 def _schema(args: argparse.Namespace) -> Answer | int:
     from mastctl.packaged import schema_files
 
     files = schema_files()
     if args.name is None:
-        return Answer(
-            {"schemas": {name: json.loads(file.read_bytes())["title"] for name, file in files.items()}}
-        )
+        titles = {name: json.loads(file.read_bytes())["title"] for name, file in files.items()}
+        return Answer({"schemas": titles})
     if args.name not in files:
         raise WrongUse(f"'{args.name}' is not a valid schema; there are {', '.join(files)}")
     sys.stdout.write(files[args.name].read_text(encoding="utf-8"))

@@ -9,17 +9,17 @@ import re
 import signal
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from mastctl import signals
 from mastctl.cli import output
 from mastctl.cli.daemon import CONFIG, DAEMON, URL, client_of, followed, queue_output
 from mastctl.cli.options import command, one_of, option
-from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, cell, chosen, tables_at, tables_of
+from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, cell, chosen, tables_at
 from mastctl.logs import QueuedHandler
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 POLL_S = 0.1  # how often `status --wait` requests the status
 ROS_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-SUFFIXES = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
+SUFFIXES: Mapping[str, Literal["png", "jpeg"]] = {".png": "png", ".jpg": "jpeg", ".jpeg": "jpeg"}
 
 STATUS = (
     "state reason hardware control.holder control.for_s joints.pan_rad joints.tilt_rad joints.true_pan_rad "
@@ -118,12 +118,19 @@ def _status(args: argparse.Namespace) -> Answer | int:
         raise WrongUse("--wait goes with the status alone or with --operation")
     with client_of(args) as client:
         if args.events is not None:
-            return show_each(args, map(_event, client.events(*args.events)))
+            return _events(args, client)
         if args.operations:
             listed = {"operations": client.operations()}
             return Answer(listed, tables_at(listed, LISTED))
         if args.operation is not None:
-            return _operation(args, client)
+            wait = args.wait is not None
+            record = (
+                followed(client, args.operation, args.json, args.wait)
+                if wait
+                else client.operation(args.operation)
+            )
+            shown = operation_shown(record, "steps.name steps.state steps.duration_s")
+            return Answer(record, shown, int(wait and record["state"] != "done"))
         status = client.status() if args.wait is None else _ready(client, args.wait)
     return Answer(status, tables_at(status, STATUS, f"mastctl at {client.url}"))
 
@@ -156,30 +163,17 @@ def _ready(client: Client, wait_s: float) -> Status:
         time.sleep(POLL_S)
 
 
-def _operation(args: argparse.Namespace, client: Client) -> Answer:
-    if args.wait is None:
-        record, code = client.operation(args.operation), 0
-    else:
-        record = followed(client, args.operation, args.json, args.wait)
-        code = int(record["state"] != "done")
-    return Answer(record, operation_shown(record, "steps.name steps.state steps.duration_s"), code)
-
-
 def operation_shown(record: Mapping[str, Any], more: str = "") -> list[Shown]:
     """Return an operation for people: its request, what was measured, and ``more`` keys."""
     return tables_at(record, f"{OPERATION} {more}", f"operation {record['id']}")
 
 
-def _event(event: Mapping[str, Any]) -> Answer:
-    value, keys = event["value"], EVENTS.get(event["topic"])
-    shown = chosen(value, keys) if keys and isinstance(value, Mapping) else value
-    return Answer(event, f"{event['topic']} {event['key']}: {cell(shown)}")
-
-
-def show_each(args: argparse.Namespace, answers: Iterable[Answer]) -> int:
-    """Show each answer as it comes, --count of them; they end with the daemon. Raises CommandError."""
-    for number, answer in enumerate(answers, 1):
-        output.show(args, answer)
+def _events(args: argparse.Namespace, client: Client) -> int:
+    """Show each event as it comes, --count of them; they end with the daemon. Raises CommandError."""
+    for number, event in enumerate(client.events(*args.events), 1):
+        value, keys = event["value"], EVENTS.get(event["topic"])
+        shown = chosen(value, keys) if keys and isinstance(value, Mapping) else value
+        output.show(args, Answer(event, f"{event['topic']} {event['key']}: {cell(shown)}"))
         if number == args.count:
             return 0
     if args.count is not None:
@@ -196,19 +190,16 @@ def show_each(args: argparse.Namespace, answers: Iterable[Answer]) -> int:
     example="navcam_left --out left.png",
 )
 def _snapshot(args: argparse.Namespace) -> Answer:
-    out = args.out
-    kind = SUFFIXES.get(out.suffix.lower())
+    from mastctl.report.pictures import with_text
+
+    out, kind = args.out, SUFFIXES.get(args.out.suffix.lower())
     if kind is None:
         raise WrongUse(f"--out is '{args.out}' where a name ending in {', '.join(SUFFIXES)} is expected")
     output.check_file(out, "--out")
-    from mastctl.report.pictures import with_text
-
     with client_of(args) as client:
-        shot = client.snapshot(args.camera, frame_id=args.frame_id, format="png" if kind == "png" else "jpeg")
-    data = shot.data
-    if kind == "png":
-        data = with_text(data, {name: str(value) for name, value in shot.facts.items()})
-    out.write_bytes(data)
+        shot = client.snapshot(args.camera, frame_id=args.frame_id, format=kind)
+    texts = {name: str(value) for name, value in shot.facts.items()}
+    out.write_bytes(with_text(shot.data, texts) if kind == "png" else shot.data)
     facts = chosen(shot.facts, "frame_id pan_rad tilt_rad moving")
     return Answer({"file": str(out), **shot.facts}, f"{out}: {cell(facts)}")
 
@@ -265,7 +256,7 @@ def _show_recording(args: argparse.Namespace) -> Answer:
     found = read_whole(args.file).summary()
     whole = found["complete"] and not found["damaged"]
     state = "whole" if whole else f"'mastctl record repair {args.file}' writes what is whole anew"
-    return Answer(found, [*tables_of(found, str(args.file)), state])
+    return Answer(found, [*tables_at(found, "", str(args.file)), state])
 
 
 @command(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from mastctl import signals
 from mastctl.cli import output
 from mastctl.cli.options import GROUPS, at_least, command, one_of, option
-from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, tables_of
+from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, tables_at
 
 if TYPE_CHECKING:
     from drivers.registry import UnitBench
@@ -86,7 +86,7 @@ def _scan(args: argparse.Namespace) -> Answer:
     names = ("baud", "model", "model_number", "firmware", "hardware_errors")
     rows = [{"id": one.servo_id} | {name: getattr(one, name) for name in names} for one in result.found]
     document = {"port": args.port, "servos": rows, "garbled_bauds": list(result.garbled)}
-    return Answer(document, [*tables_of({f"Servos on {args.port}": rows}), *garbled])
+    return Answer(document, [*tables_at({f"Servos on {args.port}": rows}), *garbled])
 
 
 @command(

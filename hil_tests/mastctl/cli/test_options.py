@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from mastctl.cli.options import Option, Parser, add_options, one_of, option
-from mastctl.cli.output import WrongUse, tables_of
+from mastctl.cli.output import WrongUse, tables_at
 
 FORMS: dict[str, tuple[Option, list[str], str, Any]] = {
     "a path": (option("FILE", ""), ["a.yaml"], "file", Path("a.yaml")),
@@ -74,7 +74,7 @@ def test_a_record_is_a_table_of_its_values_and_one_of_each_list() -> None:
         "none": None,
         "rows": [{"x": 1}, {"y": "b"}],
     }
-    values, rows = tables_of(record, "it")
+    values, rows = tables_at(record, "", "it")
     assert list(values.rows) == [
         ("a m", "1.23457"),
         ("joints.pan rad", "0.5"),
