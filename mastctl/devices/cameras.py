@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 
@@ -19,13 +20,23 @@ from drivers.clock import Clock, deadlines_on
 from drivers.errors import BadFrame, BadReply, DriverError, NoFreshFrame
 from drivers.frame_times import Offset, Pace, Pairing, learned
 from drivers.interfaces import Camera, CameraSetting, Frame, FrameTime, Reading
-from mastctl.devices import frames as frame_checks
-from mastctl.devices.frames import FrameStore, StampedFrame, check_known, check_wanted, checked_setting
+from mastctl.devices.frames import (
+    FrameStore,
+    StampedFrame,
+    check_known,
+    check_mode,
+    check_order,
+    check_size,
+    check_wanted,
+    checked,
+    checked_setting,
+)
 from mastctl.devices.joint_history import JointHistory
-from mastctl.devices.thread import Check, DeviceThread, ThreadCall
+from mastctl.devices.thread import Check, DeviceThread
 from mastctl.errors import NotNow
 
 log = logging.getLogger(__name__)
+T = TypeVar("T")
 
 HEAD = "pan_tilt"
 READINGS_S = 1.0  # for the head's readings to reach beyond an exposure
@@ -163,7 +174,7 @@ class Cameras:
         that did not deliver; BadReply if the head's readings do not reach around an exposure.
         """
         for camera in cameras:
-            frame_checks.check_known(camera, self._cameras)
+            check_known(camera, self._cameras)
         names = tuple(dict.fromkeys(cameras))
         deadline_s = self._time.now_s() + timeout_s
         exposed_after_s = self._known_from(exposed_after_s)
@@ -230,22 +241,13 @@ class Cameras:
 
     def _check_sizes(self) -> None:
         """Pass cameras that are as calibrated, or do not answer now. Raises BadFrame."""
-        until_s = self._time.now_s() + SIZE_TIMEOUT_S
-        calls = {
-            name: thread.submit(
-                "info",
-                partial(self._check_as_calibrated, name, self._cameras[name]),
-                SIZE_TIMEOUT_S,
-                noted=False,
-            )
-            for name, thread in self._threads.items()
-        }
-        for name, call in calls.items():
+        for name, thread in self._threads.items():
+            check = partial(self._check_as_calibrated, name, self._cameras[name])
             try:
-                self._threads[name].wait(call, until_s)
+                thread.call("info", check, SIZE_TIMEOUT_S, noted=False)
             except BadFrame:
-                for thread in self._threads.values():
-                    thread.end()
+                for one in self._threads.values():
+                    one.end()
                 raise
             except DriverError as error:
                 log.warning(NOT_COMPARED, error)
@@ -261,16 +263,10 @@ class Cameras:
         if isinstance(mode, SensorMode):
             self.sensor_modes[name] = mode
             if then is not None:
-                frame_checks.check_mode(name, mode, then)
-                if mode.crop_px is None and then.crop_px is not None:
-                    log.warning(
-                        "%s: its driver does not report which part of its sensor is read; the crop "
-                        "is not compared with the mast file's",
-                        name,
-                    )
+                check_mode(name, mode, then)
         if info.size_px is not None and calibrated is not None:
             width, height = map(int, info.size_px)
-            frame_checks.check_size(name, (width, height), calibrated.model.size_px)
+            check_size(name, (width, height), calibrated.model.size_px)
 
     def _settings_of(self, camera: str) -> list[CameraSetting]:
         return [checked_setting(one, camera) for one in self._cameras[camera].settings()]
@@ -293,10 +289,10 @@ class Cameras:
         answer = self._cameras[camera].next_frame(exposed_after_s, left_s)
         known = self._calibrated.get(camera)
         size_px = None if known is None else known.model.size_px
-        frame = frame_checks.checked(answer, camera, size_px, exposed_after_s, self._clock.now_s())
+        frame = checked(answer, camera, size_px, exposed_after_s, self._clock.now_s())
         if newest is not None:
             try:
-                frame_checks.check_order(frame, newest)
+                check_order(frame, newest)
             except BadFrame:  # refused once; a camera that came back counting from 0 goes on after that
                 self.store.begin_again(camera)
                 raise
@@ -313,14 +309,8 @@ class Cameras:
     def _offsets(self, names: Sequence[str], deadline_s: float) -> dict[str, Offset]:
         """What is known of each camera's times beside the first one's."""
         first = names[0]
-        calls: dict[str, ThreadCall[Pace | None]] = {}
-        for name in names:
-            left_s = max(0.0, deadline_s - self._time.now_s())
-            pace = partial(self._pace_of, name)
-            calls[name] = self._threads[name].submit("recent_times", pace, left_s + self._grace_s)
-        times = {
-            name: self._threads[name].wait(one, deadline_s + self._grace_s) for name, one in calls.items()
-        }
+        paces = {name: partial(self._pace_of, name) for name in names}
+        times = self._in_parallel("recent_times", paces, deadline_s)
         for name in names[1:]:
             before = self._learned.get((first, name))
             try:
@@ -334,15 +324,21 @@ class Cameras:
         self, after_s: Mapping[str, float], deadline_s: float, check: Check | None = None
     ) -> dict[str, Frame | StampedFrame]:
         """One frame of each named camera, exposed after its moment."""
-        calls: dict[str, ThreadCall[Frame | StampedFrame]] = {}
-        for camera, exposed_after_s in after_s.items():
-            take = partial(self._take, camera, exposed_after_s, deadline_s)
-            left_s = max(0.0, deadline_s - self._time.now_s())
-            calls[camera] = self._threads[camera].submit("next_frame", take, left_s + self._grace_s)
-        return {
-            camera: self._threads[camera].wait(call, deadline_s + self._grace_s, check)
-            for camera, call in calls.items()
-        }
+        takes = {name: partial(self._take, name, moment, deadline_s) for name, moment in after_s.items()}
+        return self._in_parallel("next_frame", takes, deadline_s, check)
+
+    def _in_parallel(
+        self,
+        call: str,
+        functions: Mapping[str, Callable[[], T]],
+        deadline_s: float,
+        check: Check | None = None,
+    ) -> dict[str, T]:
+        """What functions return in the threads of the cameras that they are named by."""
+        timeout_s = max(0.0, deadline_s - self._time.now_s()) + self._grace_s
+        calls = {name: self._threads[name].submit(call, one, timeout_s) for name, one in functions.items()}
+        late_s = deadline_s + self._grace_s
+        return {name: self._threads[name].wait(one, late_s, check) for name, one in calls.items()}
 
     def _together(self, frames: dict[str, StampedFrame]) -> dict[str, StampedFrame]:
         """Frames that serve one measurement: if the head moved between two exposures, it moved in all."""
@@ -360,8 +356,7 @@ class Cameras:
             if published:
                 self.store.publish(frame)  # until now it was only watched
             return frame
-        began_s = frame.mid_exposure_s - frame.exposure_s / 2
-        ended_s = frame.mid_exposure_s + frame.exposure_s / 2
+        began_s, ended_s = frame.exposure_began_s, frame.mid_exposure_s + frame.exposure_s / 2
         until_s = self._time.now_s() + READINGS_S
         while (newest := self._history.newest) is None or newest.time_s < ended_s:
             if self.read().time_s < ended_s and self._time.now_s() > until_s:

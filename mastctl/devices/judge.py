@@ -11,7 +11,7 @@ import logging
 import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from drivers.clock import Clock
 from drivers.errors import BadOptions
 from drivers.interfaces import AxisMotion, PanTilt, Reading
 from mastctl.answers import SunAnswer
+from mastctl.as_json import as_json
 from mastctl.control.machine import StandingFault
 from mastctl.devices.keep_out import Box, KeepOuts, Pair, Span
 from mastctl.devices.thread import REST_S
@@ -367,21 +368,11 @@ class KeepOutJudge:
         sun, now_s = self._sun, self._clock.now_s()
         if sun is None:
             return {"sun": None, "boxes": []}
-        x, y, z = sun.direction
         boxes = self._sun_boxes(self._rig, sun, self._rover_from_site) if sun.holds(now_s) else []
-        return {
-            "boxes": [
-                {"name": box.name, "pan_rad": list(box.pan_rad), "tilt_rad": list(box.tilt_rad)}
-                for box in boxes
-            ],
-            "sun": {
-                "direction": [x, y, z],
-                "frame": sun.frame,
-                "half_angle_rad": sun.half_angle_rad,
-                "left_s": None if sun.until_s is None else max(0.0, sun.until_s - now_s),
-                "active": sun.holds(now_s),
-            },
-        }
+        stated: Any = as_json(sun)
+        until_s = stated.pop("until_s")
+        left_s = None if until_s is None else max(0.0, until_s - now_s)
+        return {"sun": stated | {"left_s": left_s, "active": sun.holds(now_s)}, "boxes": as_json(boxes)}
 
     def _start(self, reading: Reading) -> tuple[Span, bool]:
         """Where the next move begins, and whether the head rests there."""
@@ -445,12 +436,6 @@ def _check_acceleration(most: float | None, stated: Mapping[str, AxisMotion], de
     """Pass a head that speeds up no faster than the limits allow. Raises BadOptions."""
     if most is None:
         return
-    if not stated:
-        log.warning(
-            "the driver of the head does not say how fast it speeds up: limits.acceleration_rad_per_s2 (%g) "
-            "is only counted with, and cannot be held against it",
-            most,
-        )
     for name, axis in stated.items():
         if axis.acceleration_rad_per_s2 > ROUNDED * most:
             raise BadOptions(

@@ -134,31 +134,27 @@ class GuardedHead(PanTilt):
         return self._head.read()
 
     def move(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float | None = None) -> None:
-        """Start the head towards a goal. Raises OutsideLimits, KeptOut, Stopped; nothing was sent then."""
-        goal = pan_rad, tilt_rad
-        self.judge.limits.check(*goal)
-        speed = self.judge.limits.speed(speed_rad_per_s)
-        with self._moving:
-            self._judged(goal, speed)
-            self._head.move(*goal, speed)
-
-    def try_refusal(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float) -> None:
-        """Send what the driver has to refuse: angles or a speed that cannot be.
+        """Start the head towards a goal, or send one that the driver has to refuse.
 
         What is judged is where a driver that takes it could go: to the limits, or nowhere for what is no
-        number. Raises as `move`.
+        number. Raises KeptOut, Stopped; nothing was sent then.
         """
-        limits, now = self.judge.limits, self._head.read()
-        pan, tilt = (
-            at if math.isnan(goal) else min(max(goal, low), high)
-            for goal, at, (low, high) in (
-                (pan_rad, now.pan_rad, limits.pan_rad),
-                (tilt_rad, now.tilt_rad, limits.tilt_rad),
-            )
-        )
+        if not self._moves:
+            raise Stopped(STILL)
+        limits, cap = self.judge.limits, self.judge.limits.speed_rad_per_s
+        too_fast = speed_rad_per_s is None or speed_rad_per_s > cap
         with self._moving:
-            self._judged((pan, tilt), limits.speed_rad_per_s)
-            self._head.move(pan_rad, tilt_rad, speed_rad_per_s)
+            now = self._head.read()
+            pan, tilt = (
+                at if math.isnan(goal) else min(max(goal, low), high)
+                for goal, at, (low, high) in (
+                    (pan_rad, now.pan_rad, limits.pan_rad),
+                    (tilt_rad, now.tilt_rad, limits.tilt_rad),
+                )
+            )
+            start = self.judge.check_move((pan, tilt), lambda: now)
+            self.judge.sent(start, (pan, tilt), cap)
+            self._head.move(pan_rad, tilt_rad, cap if too_fast else speed_rad_per_s)
 
     def stop(self) -> None:
         """As the driver; never waits for a move."""
@@ -166,12 +162,6 @@ class GuardedHead(PanTilt):
 
     def close(self) -> None:
         self._head.close()
-
-    def _judged(self, goal: tuple[float, float], speed_rad_per_s: float) -> None:
-        if not self._moves:
-            raise Stopped(STILL)
-        start = self.judge.check_move(goal, self._head.read)
-        self.judge.sent(start, goal, speed_rad_per_s)
 
 
 @contextmanager

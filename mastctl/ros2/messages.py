@@ -184,11 +184,11 @@ def _clock_line(clock: RosTime, hardware: str) -> DiagnosticStatus:
     used = clock.exchange
     if used is None:
         return status("mastctl: clock", ERROR, "the daemon's time is not known yet", {}, hardware)
-    values = {"offset_s": f"{used.offset_ns / NS:.9f}", "doubt_s": f"{used.half_s:.6f}", "steps": clock.steps}
+    values = {"offset_s": f"{used.offset_ns / NS:.9f}", "doubt_s": f"{used.half_s:.6f}"}
     level, message = OK, "ROS time follows the daemon's clock"
     if not clock.steady:
         level = WARN
-        message = f"the offset of ROS time from the daemon's clock has changed {clock.steps} times"
+        message = "the offset of ROS time from the daemon's clock has changed"
     return status("mastctl: clock", level, message, values, hardware)
 
 

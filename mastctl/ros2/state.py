@@ -32,7 +32,6 @@ NS = 1_000_000_000
 STEP_S = 1e-3  # a smaller change of the offset is not reported; on one machine only a set clock is larger
 SAME_S = 1e-4
 EXCHANGES = 30
-CALM = 60  # exchanges without a step after which the offset is steady again
 FRAMES = 64  # images of a camera whose stamps still name them; the daemon itself keeps some 32
 KEPT_NS = 10 * NS
 MOST_FRAMES = 100
@@ -99,28 +98,25 @@ def real_from_monotonic_ns() -> int:
 class RosTime:
     """Stamps of the daemon's times, by one exchange a second; read from any thread.
 
-    ``exchange`` is the one in use, None before the first; ``steps`` counts how often the offset has changed
-    by more than its uncertainty: a clock was set, or the daemon's runs otherwise than real time.
+    ``exchange`` is the one in use, None before the first. ``steady``: whether the last one changed the offset
+    by no more than its uncertainty; else a clock was set, or the daemon's runs otherwise than real time.
     """
 
     def __init__(self) -> None:
         self.exchange: ClockExchange | None = None
-        self.steps = 0
-        self._since_step = CALM
+        self.steady = True
         self._kept: deque[ClockExchange] = deque(maxlen=EXCHANGES)
 
     def update(self, new: ClockExchange) -> bool:
         """Take one more exchange; return whether the offset is another one than before."""
-        old = self.exchange
-        self._since_step += 1
+        old, was_steady = self.exchange, self.steady
         if old is not None:
             off_s = abs(new.offset_ns - old.offset_ns) / NS
-            if off_s > STEP_S + new.half_s + old.half_s:
-                if self.steady:  # a clock that runs otherwise than real time is reported once
-                    log.warning("the offset of ROS time from the daemon's clock changed by %.6f s", off_s)
-                self.steps += 1
-                self._since_step = 0
+            self.steady = off_s <= STEP_S + new.half_s + old.half_s
+            if not self.steady:
                 self._kept.clear()
+                if was_steady:  # a clock that runs otherwise than real time is reported once
+                    log.warning("the offset of ROS time from the daemon's clock changed by %.6f s", off_s)
         self._kept.append(new)
         self.exchange = new if new.one_clock else min(self._kept, key=lambda one: one.half_s)
         return old is None or old.offset_ns != self.exchange.offset_ns
@@ -128,11 +124,6 @@ class RosTime:
     def stamp_ns(self, monotonic_s: float) -> int | None:
         """Return the ROS time of one of the daemon's times, nanoseconds; None before the first exchange."""
         return None if self.exchange is None else round(monotonic_s * NS) + self.exchange.offset_ns
-
-    @property
-    def steady(self) -> bool:
-        """Whether the offset is known and has not changed for the last `CALM` exchanges."""
-        return self.exchange is not None and self._since_step >= CALM
 
 
 class NoTransform(Exception):

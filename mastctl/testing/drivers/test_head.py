@@ -22,7 +22,6 @@ from mastctl.conform.device_checks import PATIENCE_S, NotTried, PromiseBroken, b
 from mastctl.conform.rig import Angles
 from mastctl.devices.devices import MOVE_TIMEOUT_S, READ_TIMEOUT_S, STOP_TIMEOUT_S
 from mastctl.devices.frames import CLOCK_TOLERANCE_S
-from mastctl.devices.opening import GuardedHead
 
 log = logging.getLogger(__name__)
 moves_head = pytest.mark.moves_head
@@ -365,9 +364,8 @@ def _check_refused(trial: HeadTrial, goal: Angles, speed_rad_per_s: float, messa
     """Send the head where it cannot go: a DriverError, and nothing moves."""
     before = trial.settled()
     what = f"move({goal[0]!r}, {goal[1]!r}, {speed_rad_per_s!r})"
-    move = trial.head.try_refusal if isinstance(trial.head, GuardedHead) else trial.head.move
     try:
-        call("move()", lambda: move(*goal, speed_rad_per_s))
+        call("move()", lambda: trial.head.move(*goal, speed_rad_per_s))
     except DriverError as error:
         expect("\n" not in str(error), f"{what}: {str(error)!r} is not one sentence")
     else:
