@@ -140,18 +140,14 @@ class MeasuredPointing(TypedDict):
 
 
 class CountedPointing(MeasuredPointing):
-    """A pointing that counts: ``sigma_px`` of all that is expected, ``chi_square`` of ``off_px`` over that (2
-    on average)."""
+    """A pointing that counts: ``sigma_px`` of all that is expected, ``chi_square`` of ``off_px`` over it."""
 
     sigma_px: Pixel
     chi_square: float
 
 
 class ResidualVerdict(CalibrationAnswer):
-    """The verdict of residuals alone, with its figures.
-
-    ``times_expected``: residuals over what is expected, rms, all that is common taken out.
-    """
+    """The verdict of residuals alone; ``times_expected``: rms over the expected, common parts taken out."""
 
     times_expected: float | None
     log10_evidence: float | None
@@ -160,8 +156,7 @@ class ResidualVerdict(CalibrationAnswer):
 
 
 class CalibrationReport(ResidualVerdict):
-    """``GET /calibration/health``: the verdict, its figures, the newest pointings that count, and the result
-    of the drift sentinel's looks."""
+    """``GET /calibration/health``: the verdict, its figures, the newest pointings, the sentinel's looks."""
 
     newest: list[CountedPointing]
     sentinel: SentinelAnswer
@@ -234,10 +229,7 @@ class MastChange(TypedDict):
 
 
 class ClientSession(TypedDict):
-    """``GET /session``: the client, its rights, and the way it came.
-
-    ``needs_token``: whether the daemon requires one at all.
-    """
+    """``GET /session``: the client, its rights, how it came, and whether tokens are required at all."""
 
     name: str
     role: Role
@@ -288,8 +280,7 @@ class VerdictAnswer(TypedDict):
 
 
 class BenchCheck(TypedDict):
-    """Rms of corners that were not fitted, as promised, by camera; corners that were pointed at, measured and
-    promised."""
+    """Rms of corners that were not fitted, by camera, and of those pointed at: promised and measured."""
 
     promised_px: dict[str, float]
     pointings: list[Json]
@@ -298,11 +289,8 @@ class BenchCheck(TypedDict):
 
 
 class BenchResult(TypedDict):
-    """The result of a bench calibration, as ``mastctl calibrate bench --json`` has it.
-
-    ``rms_px``, ``check_rms_px``: of each camera's corners, fitted and not fitted; ``calibrated_px``,
-    ``counts_px``: what the calibration, and the encoders' counts alone, leave of a first pointing, rms an
-    axis.
+    """The result of a bench calibration: rms of each camera's corners, fitted and not; what the calibration,
+    and the encoders' counts alone, leave of a first pointing, rms an axis.
     """
 
     verdict: VerdictAnswer
@@ -316,11 +304,10 @@ class BenchResult(TypedDict):
 
 
 class BenchProgress(TypedDict):
-    """How far a bench calibration is.
+    """How far a bench calibration is; ``pictures`` of the camera with most.
 
-    ``placements`` at which the board was seen; ``pictures`` of the camera with most; ``predicted_px``,
-    ``target_px``, ``counts_px``: rms per axis of a first pointing that the calibration leaves, may leave, and
-    that counts alone leave; ``expected_px``: what it leaves after a picture at ``next_rad``.
+    ``predicted_px``, ``target_px``, ``counts_px``: rms per axis of a first pointing that the calibration
+    leaves, may leave, and that counts alone leave; ``expected_px``: after a picture at ``next_rad``.
     """
 
     placements: Count
@@ -334,10 +321,8 @@ class BenchProgress(TypedDict):
 
 
 class BenchRunRecord(BenchProgress):
-    """A bench calibration as far as it is known; ``waiting`` is for a placement.
-
-    ``most`` pictures of a camera; ``curve``: pictures and ``predicted_px``.
-    """
+    """A bench calibration as far as it is known; ``most`` pictures of a camera; ``curve``: pictures and
+    ``predicted_px``."""
 
     name: str
     begun: str

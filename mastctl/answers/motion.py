@@ -198,10 +198,7 @@ class ResetAnswer(TypedDict):
 
 
 class CameraPixel(TypedDict):
-    """What one camera saw of the target: a verdict of `calib.matching.patch`, or ``no_frame``.
-
-    Pixel and sigma are null without a good verdict.
-    """
+    """What one camera saw of the target: a verdict of `calib.matching.patch`, or ``no_frame``."""
 
     frame_id: str
     verdict: str

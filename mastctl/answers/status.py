@@ -48,10 +48,7 @@ class ErrorBody(TypedDict):
 
 
 class LiveAnswer(TypedDict):
-    """``GET /health/live``.
-
-    ``token_folder``: where the daemon reads its tokens, for a caller on its own machine, if it requires any.
-    """
+    """``GET /health/live``; ``token_folder``: where the daemon reads tokens, for callers on its machine."""
 
     live: Literal[True]
     token_folder: NotRequired[str]
@@ -135,8 +132,7 @@ class CameraAnswer(TypedDict):
 
 
 class CameraSettingAnswer(TypedDict):
-    """A setting of a camera: ``value`` null if not known, ``step`` 0 for any value between the bounds,
-    ``refusal`` why it cannot be changed, null if it can."""
+    """A setting of a camera; ``step`` 0: any value between the bounds; ``refusal``: why it cannot change."""
 
     name: str
     value: float | None
@@ -149,8 +145,7 @@ class CameraSettingAnswer(TypedDict):
 
 
 class SensorModeAnswer(TypedDict):
-    """Which pixels of its sensor a camera's pictures show; ``crop_px`` is x, y, width, height. It and
-    ``sensor_px`` are null if they are not known."""
+    """Which pixels of its sensor a camera's pictures show; ``crop_px`` is x, y, width, height."""
 
     size_px: Annotated[list[Count], Len(2, 2)]
     sensor_px: Annotated[list[Count], Len(2, 2)] | None
@@ -159,12 +154,8 @@ class SensorModeAnswer(TypedDict):
 
 
 class CameraSettingsAnswer(TypedDict):
-    """The settings of a camera that can change; ``held``: an operation keeps them as they are.
-
-    ``sensor_mode``: of the camera as it was opened, null where it does not know it.
-
-    ``notes``: a sentence for each setting that became another than requested.
-    """
+    """The settings of a camera; ``held``: an operation keeps them as they are; ``sensor_mode`` as it was
+    opened; ``notes``: a sentence for each setting that became another than requested."""
 
     camera: str
     settings: list[CameraSettingAnswer]
@@ -209,10 +200,7 @@ class MastAnswer(TypedDict):
 
 
 class SentinelAnswer(TypedDict):
-    """``GET /sentinel``: what its looks say together; ``none`` without a reference.
-
-    ``reference``, ``last_look`` and ``since`` (of a change) as ISO 8601.
-    """
+    """``GET /sentinel``: what its looks say together; ``none`` without a reference. Times as ISO 8601."""
 
     level: Literal["none", "good", "unsure", "bad"]
     sentence: str
@@ -224,8 +212,7 @@ class SentinelAnswer(TypedDict):
 
 
 class CalibrationAnswer(TypedDict):
-    """Whether the mast file is still valid, by all kinds of evidence; ``since`` (ISO 8601, UTC) where it is
-    not."""
+    """Whether the mast file is still valid, by all evidence; ``since`` (ISO 8601) where it is not."""
 
     verdict: Literal["good", "drifts", "few", "unknown"]
     sentence: str

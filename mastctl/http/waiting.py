@@ -3,7 +3,7 @@
 The event loop itself never waits for a lock, a file or a device. Work that may wait runs in worker threads; a
 request that waits when the daemon ends is refused at once, and its thread's result is dropped. Images have a
 limit of their own for each camera, so that a dead camera, however often it is requested, takes no thread from
-anything else. Long computations run in a few threads of the lowest priority.
+anything else. Of long computations a few are at work at once.
 
 The web server bounds neither how long a client takes to send a request nor how many connections it opens. A
 hundred clients that send nothing, or headers without their body, could use up the descriptors of the process,
@@ -14,12 +14,10 @@ after a while, the oldest when they are many.
 from __future__ import annotations
 
 import asyncio
-import os
 import resource
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
@@ -37,7 +35,6 @@ WORKERS = 40  # threads for everything but images
 IMAGES_AT_ONCE = 4  # of one camera
 IMAGE_QUEUE_S = 2.0  # how long a request waits for those before it
 ENCODERS = 2
-ENCODERS_NICE = 10  # a stop's threads, and the event loop, go first
 
 
 class Waiting:
@@ -53,14 +50,14 @@ class Waiting:
         self._turn = asyncio.Lock()
         self._workers = CapacityLimiter(WORKERS)
         self._images: dict[tuple[str, bool], CapacityLimiter] = {}
-        self._encoders = ThreadPoolExecutor(ENCODERS, "encoding", _lower_priority)
+        self.encoding = threading.BoundedSemaphore(ENCODERS)
+        """For long computations in the threads of `image`: a few at once."""
 
     def end(self) -> None:
         """Refuse what waits now and what will come."""
         self._ended = True
         for scope in self._scopes:
             scope.cancel()
-        self._encoders.shutdown(wait=False, cancel_futures=True)
 
     async def turn(self) -> None:
         """Return one turn of the event loop after the call before: what is no stop begins in turn.
@@ -69,20 +66,6 @@ class Waiting:
         """
         async with self._turn:
             await asyncio.sleep(0)
-
-    def encode(self, function: Callable[[], T]) -> T:
-        """Return the result of ``function()``, which computes for long: a few at once, after all other work.
-
-        For a worker thread of `run` or `image`. Raises Unable ``closing``.
-        """
-        try:
-            encoded = self._encoders.submit(function)
-        except RuntimeError:  # the daemon ends
-            raise _closing() from None
-        try:
-            return encoded.result()
-        except CancelledError:
-            raise _closing() from None
 
     async def run(self, function: Callable[[], T]) -> T:
         """Return the result of ``function()``, run in a worker thread. Raises Unable ``closing``."""
@@ -127,11 +110,6 @@ class Waiting:
 
 def _closing() -> Unable:
     return Unable("closing", "the daemon ends; the request will not be served")
-
-
-def _lower_priority() -> None:
-    """Let this thread come after all others; Linux counts niceness by thread."""
-    os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), ENCODERS_NICE)
 
 
 MOST_STREAMS = 100

@@ -93,7 +93,8 @@ def add_images(app: FastAPI) -> None:
                 frame = service.snapshot(camera, query.fresh)
             else:
                 frame = service.kept_frame(camera, frame_id)
-            data = waiting.encode(lambda: encoded(frame.image, query.format))
+            with waiting.encoding:
+                data = encoded(frame.image, query.format)
             return Response(data, media_type=f"image/{query.format}", headers=headers_of(frame))
 
         return await waiting.image(camera, picture, kept=frame_id is not None)

@@ -13,8 +13,7 @@ import pytest
 
 import drivers
 import mastctl
-from calib.errors import CalibError
-from drivers.errors import BadOptions, DriverError, NoFreshFrame, NoReply
+from drivers.errors import DriverError
 from mastctl.errors import (
     BadRequest,
     MastctlError,
@@ -23,7 +22,6 @@ from mastctl.errors import (
     NotKnown,
     NotLetIn,
     NotNow,
-    Stopped,
     Unable,
 )
 from mastctl.http.refusals import status_of
@@ -81,25 +79,3 @@ def test_each_error_class_has_a_code_of_the_table(
             told = vars(kind).get("code") or kind.__name__ in ("_Family", PointingError.__name__)
             assert told, f"{kind.__name__} has neither a family nor a code of its own"
             assert told is True or told in known | NO_ANSWER, kind.__name__
-
-
-@pytest.mark.parametrize(
-    ("error", "status"),
-    [
-        (BadRequest("bad_aim", "no"), 422),
-        (NotLetIn("no_token", "no"), 401),
-        (NotAllowed("role", "no"), 403),
-        (NotKnown("unknown_camera", "no"), 404),
-        (NoLonger("frame_too_old", "no"), 410),
-        (Stopped("no"), 409),
-        (Unable("closing", "no"), 503),
-        (MastctlError("no"), 500),
-        (CalibError("no"), 422),
-        (BadOptions("no"), 422),
-        (NoReply("no"), 504),
-        (NoFreshFrame("no"), 504),
-        (DriverError("no"), 502),
-    ],
-)
-def test_a_family_answers_with_one_status(error: Exception, status: int) -> None:
-    assert status_of(error) == status

@@ -52,22 +52,6 @@ def test_a_picture_comes_with_its_facts_and_uncompressed(pair: BOTH) -> None:
     assert not facts["reduced"]
 
 
-def test_who_shows_none_is_sent_one_and_then_none_until_it_says_so(pair: BOTH) -> None:
-    daemon, hardware = pair
-    with watching(daemon.url, LEFT) as line:
-        first = received(line)[0]
-        with pytest.raises(TimeoutError):
-            line.recv(timeout=0.2)
-        asked = len(hardware.fake_cameras[LEFT].asked)
-        with pytest.raises(TimeoutError):
-            line.recv(timeout=0.2)
-        assert len(hardware.fake_cameras[LEFT].asked) == asked, "nobody is ready, so the camera is not asked"
-        line.send(LEFT)
-        second = received(line)[0]
-    assert first["sequence"] < second["sequence"]
-    assert second["mid_exposure_s"] - first["mid_exposure_s"] > 0.2, "the newest, not the next in a queue"
-
-
 def test_a_slow_link_asks_for_the_time_first_and_then_for_small_pictures(pair: BOTH) -> None:
     daemon, hardware = pair
     with watching(f"{daemon.url}", f"{LEFT}&on_request=true") as line:
@@ -111,17 +95,6 @@ def test_a_camera_that_fails_holds_no_other_up_and_comes_back(
             name = received(line)[0]["camera"]
             seen.add(name)
             line.send(name)
-
-
-def test_a_camera_without_viewers_takes_no_picture(pair: BOTH) -> None:
-    daemon, hardware = pair
-    for camera in (LEFT, RIGHT):
-        with watching(daemon.url, camera) as line:
-            received(line)
-    asked = len(hardware.fake_cameras[LEFT].asked)  # with one that was under way when its viewer left
-    with watching(daemon.url, RIGHT) as line:
-        received(line)
-    assert len(hardware.fake_cameras[LEFT].asked) == asked
 
 
 @pytest.mark.parametrize("query, status", [("", 422), ("?camera=nobody", 404), ("?camera=a&quality=3", 422)])
