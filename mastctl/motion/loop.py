@@ -285,10 +285,7 @@ class PointingLoop(Steps):
     def _confirmed(
         self, clicked: Clicked, now: CameraView, seen: PatchMatch, others: Mapping[str, CameraView]
     ) -> list[tuple[CameraView, PatchMatch]]:
-        """Have other cameras confirm what the aiming one shows; their views and matches.
-
-        That the thing does not move between exposures of several cameras follows from the repetition.
-        """
+        """Have other cameras confirm what the aiming one shows; their views and matches."""
         pair = {clicked.view.frame.camera, self.cameras.partner(clicked.view.frame.camera)}
         confirmed = []
         with self.step("eyes") as detail:
@@ -303,17 +300,14 @@ class PointingLoop(Steps):
     def _repeated(
         self, clicked: Clicked, first: CameraView, seen: PatchMatch, settled: HeadReading, aim_px: FloatArray
     ) -> tuple[CameraView, PatchMatch]:
-        """Find the clicked thing in a later image of the same camera, where the first one showed it.
+        """Find the clicked thing in a later image of the same camera, where the ``first`` one showed it.
 
-        ``first`` and ``seen`` are the first image after the move, and where that shows it; ``settled`` is the
-        head when it had come to rest. Returns the later image and where that shows it; the first one's, if
-        the settings want no second. The record gets ``repeated_after_s``, ``apart_px`` (x, y) and
-        ``fresh_to_s``: images older than their stamps by up to that, seconds, would not have passed. 0 where
-        both are the same to the last bit, as of a camera that froze or of a replay.
+        Returns the later image and where that shows it; the first one's, if no second is wanted. The record
+        gets ``repeated_after_s``, ``apart_px`` (x, y) and ``fresh_to_s``: images older than their stamps by
+        up to that would not have passed; 0 where both are the same to the last bit: a camera froze.
 
         Raises PointingError ``not_repeated`` if it is elsewhere by more than three sigma and what the joints
-        read between the two (a head at rest may dither by some counts), or not found; DriverError if the
-        image does not come.
+        read between the two (a head at rest may dither by some counts), or not found.
         """
         if not self._repeat_after_s:
             return first, seen
@@ -358,8 +352,8 @@ class PointingLoop(Steps):
     def _measure_again(self, confirmed: Sequence[tuple[CameraView, PatchMatch]]) -> None:
         """Measure the position again in the new images, by the aiming camera and its partner.
 
-        Where another pair stood in for the partner it gives the range only; the direction stays the aiming
-        camera's own, free of what the mast file has wrong between the two.
+        Another pair gives the range only; the direction stays the aiming camera's own, free of what the mast
+        file has wrong between the two.
         """
         if len(confirmed) < 2:
             with self.step("triangulate"):

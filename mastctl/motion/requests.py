@@ -35,11 +35,10 @@ DeadlineS = Annotated[float, Field(gt=0.0, le=LONGEST_DEADLINE_S, allow_inf_nan=
 class PointingError(MastctlError):
     """The request failed; the daemon stopped the mast.
 
-    ``code`` is its own, or that of a request that does not fit, of a driver, limits or geometry. Of a search
-    for the target that found none: ``target_flat`` (the image around it has too little texture, or along one
-    direction only), ``target_ambiguous`` (a second place fits nearly as well), ``target_border`` (it lies at
-    the border of an image or of the search window), ``target_not_found`` (hidden, changed, or at another
-    range). ``step`` is the step that failed, ``result`` has the pointings done before it.
+    ``code`` is its own, or that of what ended it. Of a search for the target that found none: ``target_flat``
+    (too little texture, or along one direction only), ``target_ambiguous`` (a second place fits nearly as
+    well), ``target_border`` (at the border of an image or of the search window), ``target_not_found``
+    (hidden, changed, or at another range). ``step`` failed, ``result`` has the pointings done before it.
     """
 
     def __init__(self, code: str, message: str, step: str = "", result: PointingResult | None = None) -> None:
@@ -191,10 +190,7 @@ class PointRequest(TrackRequest):
 
 
 def aim_of(request: PointRequest, rig: Rig) -> Aim:
-    """Return the request's aim, or the default where it names none.
-
-    Raises BadRequest ``bad_aim`` (no camera that is configured and turns with the head), ``outside_image``.
-    """
+    """Return the request's aim, or the default. Raises BadRequest ``bad_aim``, ``outside_image``."""
     aim = request.aim
     on_head = [name for name, camera in rig.cameras.items() if camera.on == "head"]
     if aim is None:
@@ -214,11 +210,7 @@ def aim_of(request: PointRequest, rig: Rig) -> Aim:
 
 
 def clicked_frame(target: PixelTarget, rig: Rig, find: Callable[[str], StampedFrame]) -> StampedFrame:
-    """Return the frame that was clicked in, by ``find``, if its camera, the pixel and its moment serve.
-
-    Raises NotKnown, BadRequest, NotNow ``unknown_camera``, ``wrong_camera``, ``outside_image``,
-    ``frame_moving``; whatever ``find`` raises.
-    """
+    """Return the frame that was clicked in, by ``find``, if its camera, the pixel and its moment serve."""
     camera = target.camera
     check_known(camera, rig.cameras)
     frame = find(target.frame_id)
@@ -237,10 +229,7 @@ def wrong_camera(frame: StampedFrame, camera: str) -> BadRequest:
 
 
 def check_pair(camera: str, rig: Rig, mast_file: Rig) -> None:
-    """Pass a camera whose stereo partner is configured too, as a track needs.
-
-    ``rig`` has the cameras that are configured, ``mast_file`` all. Raises BadRequest ``no_stereo``.
-    """
+    """Pass a camera whose stereo partner is in ``rig`` too. Raises BadRequest ``no_stereo``."""
     if any(camera in cameras for cameras in rig.stereo.values()):
         return
     reason = f"{camera} is in no stereo pair of the mast file"

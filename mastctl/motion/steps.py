@@ -67,12 +67,11 @@ class Steps:
     lie on the way to the commanded angles (a replayed head is there at once). The head has settled when it
     rests (`RestWatch`); it has arrived when it rests where it was sent.
 
-    ``rig`` is the configured part of the mast file in use; ``limits`` are for the choice among solutions,
-    ``devices`` checks them again. ``clock`` stamps readings and frames. ``record`` gets each step when it
-    ends. ``cancelled`` is set by a stop; the request ends with PointingError ``stopped`` soon after.
-
-    ``last`` is the step that was begun last, ``pointing`` the pointing of the request that the next steps
-    belong to, ``motion_evidence`` what the last images say about the move before them, by camera.
+    ``rig`` is the configured part of the mast file in use; ``limits`` are for the choice among solutions.
+    ``record`` gets each step when it ends. ``cancelled`` is set by a stop; the request ends with
+    PointingError ``stopped`` soon after. ``last`` is the step that was begun last, ``pointing`` the pointing
+    that the next steps belong to, ``motion_evidence`` what the last images say about the move before them, by
+    camera.
     """
 
     def __init__(
@@ -178,11 +177,10 @@ class Steps:
         return resting
 
     def chosen(self, solutions: Sequence[Solution], start: HeadReading) -> Solution:
-        """Return the one of several true joint angles of the closed form that is taken from a start.
+        """Return the solution of the closed form (true joint angles) that is taken from a start.
 
         Of those that no keep-out bars, upright ones first, then the nearest; an angle is taken whole turns
-        away too, where a cable lets the pan turn so far. Raises Unreachable if none lies within the limits;
-        KeptOut of the one that would have been taken, if keep-outs bar all that do.
+        away too, where a cable lets the pan turn so far. Raises Unreachable, KeptOut.
         """
 
         def goal(one: Solution) -> Pair:
@@ -240,8 +238,7 @@ class Steps:
     def arrived(self, pan_rad: float, tilt_rad: float, deadline_s: float) -> HeadReading:
         """Wait until the head rests at these angles and return the reading.
 
-        Raises PointingError ``did_not_arrive`` with how far it is off, ``did_not_settle`` if it never rests
-        before the deadline (clock time, seconds), ``stopped``; else as `read`.
+        Raises PointingError ``did_not_arrive``, ``did_not_settle`` at the deadline (clock time), ``stopped``.
         """
         watch = RestWatch(DWELL_S, DITHER_RAD)
         while True:

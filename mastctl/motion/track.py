@@ -59,8 +59,7 @@ class RoverPose:
 
     ``covariance`` is (6, 6) of the motion since the pose before: small rotation, rad², then translation, m²,
     both along the rover's axes of this pose, as `calib.matching.track.moved_track` has it. ``time_s`` is by
-    the sender's clock, which need not be the daemon's. Both are None where not stated. ``received_s`` is when
-    it came, seconds of CLOCK_MONOTONIC.
+    the sender's clock. Both are None where not stated. ``received_s`` is of CLOCK_MONOTONIC.
     """
 
     site_from_rover: Rigid
