@@ -1,13 +1,12 @@
 """What the daemon is doing: the facts, and the state and the reason that follow from them.
 
 Operations, devices and the tracker report the facts to the one `StateMachine`, and the daemon's state is read
-from it. Each change is published once, in order, as ``("state", "machine", Standing)``. The lock is kept for
-one change and its publication, which wait for nothing. Reading takes no lock.
+from it. Each change is published once, in order, as ``("state", "machine", Standing)``. The publisher's lock
+is kept for one change and its publication, which wait for nothing. Reading takes no lock.
 """
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -220,7 +219,6 @@ class StateMachine:
     ) -> None:
         self.publisher = publisher or Publisher()
         self._clock = clock
-        self._lock = threading.Lock()
         self._standing = Standing(since_s=clock.now_s(), latched=tuple(latched))
         self.publisher.publish("state", "machine", self._standing)
 
@@ -299,7 +297,7 @@ class StateMachine:
 
     def _change(self, change: Callable[[Standing], Standing]) -> None:
         """Take other facts; publish a change."""
-        with self._lock:
+        with self.publisher.lock:
             before = self._standing
             now = change(before)
             if now.stopping and now.stops == 0 and now.operation is None:

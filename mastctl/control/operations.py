@@ -120,6 +120,7 @@ class _Running:
     """
 
     id: str
+    thread: threading.Thread | None = None
     cancelled: threading.Event = field(default_factory=threading.Event)
     ended_by: MastctlError = field(default_factory=lambda: Stopped(STOP_REQUESTED))
     late: tuple[float, MastctlError] | None = None
@@ -177,7 +178,10 @@ class OperationRunner:
             self._keep(operation)
             current = self._current = _Running(name)
         try:
-            self._clock.thread(lambda: self._work(current, work, on_end), f"operation {name}").start()
+            current.thread = self._clock.thread(
+                lambda: self._work(current, work, on_end), f"operation {name}"
+            )
+            current.thread.start()
         except RuntimeError as error:  # no thread to be had: nothing has moved, and the next may have one
             unable = Unable("no_thread", f"operation {name} was not started: {error}")
             self._end(current, "failed", None, error_body(unable))
@@ -287,14 +291,15 @@ class OperationRunner:
         self._mover.block_moves(self, CLOSING)
         with self._logged("as the service closes"):
             self._mover.stop()
-        closing, until_s = Stopped(CLOSING), self._time.now_s() + END_TIMEOUT_S
+        closing = Stopped(CLOSING)
         with self._changed:
-            self._closed = True
+            self._closed, current = True, self._current
             self._changed.notify_all()
             self._cancel(closing)
-            while (current := self._current) is not None and (left_s := until_s - self._time.now_s()) > 0:
-                self._changed.wait(left_s)
-        if current is not None:
+        if current is None or current.thread is None or not current.thread.is_alive():
+            return  # one that is about to start finds itself cancelled
+        current.thread.join(END_TIMEOUT_S)  # in real time, whatever a simulated rover's clock does
+        if current.thread.is_alive():
             log.error("operation %s did not end within %.0f s; it is given up", current.id, END_TIMEOUT_S)
             self._end(current, "stopped", None, error_body(closing))
 
