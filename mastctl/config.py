@@ -84,7 +84,7 @@ class Listen(Record, json_schema_extra=_ONE_OR_THE_OTHER):
     def _is_one_address(self) -> Listen:
         for other in ("host", "port"):
             if self.socket is not None and other in self.model_fields_set:
-                raise problem(other, "stands beside 'socket'; one or the other is expected")
+                raise problem(other, "is given beside 'socket'; one or the other is expected")
         return self
 
     @property

@@ -81,7 +81,8 @@ class Latch:
             if not self.entries:
                 self.since_s = time.monotonic()
             self.entries = _merged((*self.entries, cause))
-            return next((one for one in self.entries if _same(one, cause)), cause)
+            given = cause.name, cause.reason
+            return next((one for one in self.entries if (one.name, one.reason) == given), cause)
 
     def keep(self, timeout_s: float) -> bool:
         """Have the disk hold what is latched; return whether it does within ``timeout_s`` seconds."""
@@ -199,15 +200,10 @@ def _entries(file: StateFile) -> Sequence[Latched]:
 
 def _merged(entries: Iterable[Latched]) -> tuple[Latched, ...]:
     """The causes, each once, `MOST` at most."""
-    merged: list[Latched] = []
+    by_cause: dict[tuple[str, str], Latched] = {}
     for one in entries:
-        if len(merged) < MOST and not any(_same(one, other) for other in merged):
-            merged.append(one)
-    return tuple(merged)
-
-
-def _same(one: Latched, other: Latched) -> bool:
-    return (one.name, one.reason) == (other.name, other.reason)
+        by_cause.setdefault((one.name, one.reason), one)
+    return tuple(by_cause.values())[:MOST]
 
 
 def _now() -> str:

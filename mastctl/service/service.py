@@ -364,9 +364,8 @@ class Service:
         closed, self._closed = self._closed, True
         if closed:
             return
-        folders = self.folder, self.head_folder, self._socket_folder
-        maybe = (self.stop_socket, self.journals, self.latch, *folders)
-        first_to_last: tuple[Callable[[], object], ...] = (
+        files = self.journals, self.latch, self.folder, self.head_folder, self._socket_folder
+        for close in (
             self.leases.close,
             self.operations.close,
             self.bench.close,
@@ -376,11 +375,12 @@ class Service:
             self.recorder.close,
             self._close_hardware,
             self.stop_threads.close,
-            *(one.close for one in maybe if one is not None),
-        )
-        with contextlib.ExitStack() as rest:  # none is skipped, whatever ends another one
-            for close in reversed(first_to_last):
-                rest.callback(_tried, close)
+            *(one.close for one in (self.stop_socket, *files) if one is not None),
+        ):
+            try:
+                close()
+            except Exception:  # a defect of one part must not keep the others open
+                log.exception("a part of the daemon could not be closed")
 
     def _close_hardware(self) -> None:
         try:
@@ -474,14 +474,6 @@ def published_value(topic: Topic, value: Any, now_s: float) -> Any:
 def _attached(mast: MastInUse) -> AttachedMast:
     """A mast file as a recording has it."""
     return AttachedMast(mast.stored.rig, Attached(mast.path.name, mast.data))
-
-
-def _tried(close: Callable[[], object]) -> None:
-    """Close a part; a defect of one must not keep the others open."""
-    try:
-        close()
-    except Exception:
-        log.exception("a part of the daemon could not be closed")
 
 
 def _run_names(hardware: Hardware, clock: Clock) -> Callable[[], str]:

@@ -221,16 +221,3 @@ def test_a_factory_that_blocks_is_named_and_the_service_starts_without_it(
         hang.let_go()
         until(lambda: not told(service, "navcam_left"), "joined")
         assert service.snapshot("navcam_left", fresh=True).camera == "navcam_left"
-
-
-def test_a_stop_is_not_kept_by_a_camera_that_is_absent_or_blocks(
-    bench: Bench, tmp_path: Path, hasty: None
-) -> None:
-    bench.before_eye["navcam_left"] = Away(NoReply("no answer"))
-    hang = bench.before_eye["navcam_right"] = Hang()
-    with serving(tmp_path) as service:
-        calls = bench.heads[0].calls
-        before = calls.count(("stop",))
-        service.stopping.stop()
-        assert calls.count(("stop",)) > before
-        hang.let_go()

@@ -34,10 +34,6 @@ def test_ages_count_to_one_moment_and_are_never_below_zero() -> None:
     assert (camera["frame_id"], camera["sequence"], camera["exposure_s"]) == ("id", 7, 0.01)
 
 
-def test_what_is_not_known_of_a_camera_yet_is_null() -> None:
-    assert set(camera_answer(None, 100.0).values()) == {None}
-
-
 @pytest.mark.parametrize("part", ["drift", "recorder", "audit"])
 def test_each_own_fault_is_published_and_in_the_status(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, part: str
