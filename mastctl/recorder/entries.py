@@ -132,7 +132,7 @@ class Entries:
 
     def write_cameras(self, file: RecordFile, time_s: float) -> None:
         """Write every camera's calibration."""
-        time_ns = file.clocks.ns(time_s)
+        time_ns = file.ns(time_s)
         for name, camera in self.mast.rig.cameras.items():
             message, record = calibration(name, camera, self.mast.file.digest, time_ns)
             file.add_json(f"/camera/{name}/cahvor", record, time_s, RecordedCamera)
@@ -181,7 +181,7 @@ class Entries:
         time_s = self._joints_written_s = reading["measured_s"]
         file.add_json("/joints", reading, time_s, HeadAnswer)
         true_rad = reading["true_pan_rad"], reading["true_tilt_rad"]
-        tree = transforms(self.mast.rig, *true_rad, file.clocks.ns(time_s))
+        tree = transforms(self.mast.rig, *true_rad, file.ns(time_s))
         file.add_message("/tf", tree, time_s)
 
     def _write_frame(self, file: RecordFile, frame: StampedFrame) -> None:
@@ -191,7 +191,7 @@ class Entries:
         time_s = frame.mid_exposure_s
         facts = {name: as_json(getattr(frame, name)) for name in FACTS} | {"colour": frame.image.ndim == 3}
         file.add_json(f"/camera/{frame.camera}/frame", facts, time_s, FrameFacts)
-        image = picture(frame, file.clocks.ns(time_s))
+        image = picture(frame, file.ns(time_s))
         file.add_message(f"/camera/{frame.camera}/image", image, time_s)
 
     def _write_json(self, file: RecordFile, one: Entry) -> None:
@@ -207,7 +207,7 @@ class Entries:
         if position_m := one.value["position_m"]:
             target = {"operation": one.key, "position_m": position_m, "range_m": one.value["range_m"]}
             file.add_json("/target", target, one.time_s, RecordedTarget)
-            scene = target_scene(position_m, file.clocks.ns(one.time_s))
+            scene = target_scene(position_m, file.ns(one.time_s))
             file.add_message("/target/scene", scene, one.time_s)
 
 

@@ -154,7 +154,7 @@ def read_whole(path: Path) -> Recording:
             elif isinstance(item, Metadata):
                 one.facts.update(item.metadata)
             elif isinstance(item, Attachment):
-                _attach(one, file, Attached(item.name, bytes(item.data), item.media_type))
+                _attach(one, file, Attached(item.name, bytes(item.data)))
             elif isinstance(item, McapEntry) and item.channel.topic in ("/operation", "/handoff"):
                 record = _record(item.message.data)
                 if item.channel.topic == "/handoff" and record:

@@ -31,7 +31,7 @@ from mastctl.devices.frames import StampedFrame
 from mastctl.errors import MastctlError, NotKnown, NotNow, Unable
 from mastctl.recorder.entries import AttachedMast, Entries, Entry
 from mastctl.recorder.folder import MB, Recorded, RecordFolder, RecordSettings
-from mastctl.recorder.writer import Attached, Clocks, RecordFile
+from mastctl.recorder.writer import Attached, RecordFile
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -212,45 +212,33 @@ class Recorder:
             news = self._news.wait(WAIT_S if self._requests.empty() else 0.0)
             since_s, taken_s = taken_s, time.monotonic()  # these values were published between the two
             self._busy_since_s = time.monotonic()
-            self._guarded(lambda: self._write(news, since_s))  # noqa: B023
+            self._do(lambda: self._write(news, since_s), Future())  # noqa: B023
             while not self._requests.empty():
-                self._answer(*self._requests.get())
-            self._guarded(self._look_after)
+                self._do(*self._requests.get())
+            self._do(self._look_after, Future())
             self._busy_since_s = None
             if closing and not news:
-                self._guarded(self._end_file)
+                self._do(self._end_file, Future())
                 return
             if self._news.closed and not news:
                 time.sleep(WAIT_S)  # the publisher was closed first
 
-    def _answer(self, act: Callable[[], Any], answer: Future[Any]) -> None:
+    def _do(self, act: Callable[[], Any], answer: Future[Any]) -> None:
+        """Do something; whatever the disk does, the thread goes on, with another file after a while."""
         try:
             answer.set_result(act())
-        except OSError as error:
-            self._failed(error)
-            answer.set_exception(Unable("unwritable", self._fault.message if self._fault else ""))
+        except OSError as error:  # the file is left as by a daemon that was killed
+            reason = f"{self._folder.path} cannot be written: {error.strerror or error}"
+            file = self._stop_writing("unwritable", reason, "it can be written again")
+            if file is not None:
+                with contextlib.suppress(OSError):
+                    file.abandon()
+            answer.set_exception(Unable("unwritable", self._fault.message if self._fault else reason))
         except MastctlError as error:
             answer.set_exception(error)
-        except Exception as error:  # a defect must not end the thread
+        except Exception as error:
             log.exception("the recorder met a defect of the program")
             answer.set_exception(error)
-
-    def _guarded(self, work: Callable[[], None]) -> None:
-        """Do something; whatever the disk does, the thread goes on."""
-        try:
-            work()
-        except OSError as error:
-            self._failed(error)
-        except Exception:
-            log.exception("the recorder met a defect of the program")
-
-    def _failed(self, error: OSError) -> None:
-        """Give the file up, as a killed daemon leaves it, and try another one after a while."""
-        reason = f"{self._folder.path} cannot be written: {error.strerror or error}"
-        file = self._stop_writing("unwritable", reason, "it can be written again")
-        if file is not None:
-            with contextlib.suppress(OSError):
-                file.abandon()
 
     def _stop_writing(self, code: str, reason: str, until: str = NEXT_RUN) -> RecordFile | None:
         """End the run; record nothing for some seconds if a disk may recover; report the fault, and return
@@ -310,7 +298,7 @@ class Recorder:
         mast, file = self._mast(), self._file
         if self._entries.use_mast(mast) and file is not None:
             time_s, file.published_s = self._clock.now_s(), time.monotonic()
-            file.attach(mast.file, file.clocks.ns(time_s))
+            file.attach(mast.file, time_s)
             self._entries.write_cameras(file, time_s)
 
     def _notice_fault(self, one: Entry) -> None:
@@ -376,9 +364,9 @@ class Recorder:
         if self._disk_is_low(RESUME_FREE if before is not None and before.code == "disk_low" else 1.0):
             return None
         path = self._folder.next_segment() if run is None else self._folder.next_run(run)
-        clocks = Clocks(self._clock.now_s(), time.time_ns())
         facts = self._facts | ({} if run is None else {"run": path.stem})
-        file = self._file = RecordFile(path, [self._entries.mast.file, *self._others], facts, clocks)
+        attached, now_s = [self._entries.mast.file, *self._others], self._clock.now_s()
+        file = self._file = RecordFile(path, attached, facts, now_s, time.time_ns())
         self._begun_s, self._run = time.monotonic(), None if run is None else path.stem
         if run is not None or (before is not None and before.until != NEXT_RUN):
             self._fault = None

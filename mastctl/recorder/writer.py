@@ -46,7 +46,6 @@ class Attached:
 
     name: str
     data: bytes
-    media_type: str = "application/yaml"
 
     @property
     def digest(self) -> str:
@@ -54,32 +53,21 @@ class Attached:
         return hashlib.sha256(self.data).hexdigest()
 
 
-@dataclass(frozen=True)
-class Clocks:
-    """The daemon's clock and the calendar at one moment: one pair a file, so that it shows no set-back."""
-
-    monotonic_s: float
-    unix_ns: int
-
-    def ns(self, time_s: float) -> int:
-        """Return a moment of the daemon's clock as nanoseconds since 1970."""
-        return max(0, self.unix_ns + round((time_s - self.monotonic_s) * 1e9))
-
-
 class RecordFile:
     """An MCAP file that grows. Not for several threads at once; the properties may be read by any.
 
     ``path`` must not exist yet; ``attached``, mast file and configuration, and ``facts``, the metadata
-    ``mastctl``, are written first; ``clocks`` stamp the messages. ``published_s``: when the messages that are
-    added now were published, by `time.monotonic`. Every method raises OSError if the file cannot be written;
-    then it is as a killed daemon leaves it.
+    ``mastctl``, are written first. ``now_s`` by the daemon's clock is ``unix_ns`` by the calendar: one pair a
+    file, so that it shows no set-back. ``published_s``: when the messages that are added now were published,
+    by `time.monotonic`. Every method raises OSError if the file cannot be written; then it is as a killed
+    daemon leaves it.
     """
 
     def __init__(
-        self, path: Path, attached: list[Attached], facts: Mapping[str, str], clocks: Clocks
+        self, path: Path, attached: list[Attached], facts: Mapping[str, str], now_s: float, unix_ns: int
     ) -> None:
         self.path = path
-        self.clocks = clocks
+        self._now_s, self._unix_ns = now_s, unix_ns
         self.published_s = time.monotonic()
         self._file = path.open("xb")
         self._writer = Writer(self._file, chunk_size=1 << 40, compression=CompressionType.ZSTD)
@@ -95,10 +83,10 @@ class RecordFile:
         try:
             self._writer.start(PROFILE, "mastctl")
             digests = {f"sha256 {one.name}": one.digest for one in attached}
-            times = {"monotonic_s": repr(clocks.monotonic_s), "unix_ns": str(clocks.unix_ns)}
+            times = {"monotonic_s": repr(now_s), "unix_ns": str(unix_ns)}
             self._writer.add_metadata("mastctl", {**facts, **times, **digests})
             for one in attached:
-                self.attach(one, clocks.unix_ns)
+                self.attach(one, now_s)
             self.flush()
         except BaseException:
             self.abandon()
@@ -115,13 +103,17 @@ class RecordFile:
         """How long the disk has not answered, seconds."""
         return 0.0 if self._synced.done() else time.monotonic() - self._sync_since_s
 
-    def attach(self, one: Attached, time_ns: int) -> None:
+    def ns(self, time_s: float) -> int:
+        """Return a moment of the daemon's clock as nanoseconds since 1970."""
+        return max(0, self._unix_ns + round((time_s - self._now_s) * 1e9))
+
+    def attach(self, one: Attached, time_s: float) -> None:
         """Put a file into the recording, unless the same is in it."""
-        if one.digest in self._attached:
-            return
-        self._attached.add(one.digest)
-        self._writer.flush()  # type: ignore[no-untyped-call]  # what was gathered comes before it
-        self._writer.add_attachment(time_ns, time_ns, one.name, one.media_type, one.data)
+        if one.digest not in self._attached:
+            self._attached.add(one.digest)
+            self._writer.flush()  # type: ignore[no-untyped-call]  # what was gathered comes before it
+            times = self.ns(time_s), self.ns(time_s)
+            self._writer.add_attachment(*times, one.name, "application/yaml", one.data)
 
     def add_json(self, topic: str, record: Mapping[str, Any], time_s: float, kind: Any = None) -> None:
         """Add one JSON message; ``kind`` is the type of its record, any object without one."""
@@ -182,7 +174,7 @@ class RecordFile:
             self._open_since_s = self.published_s
         self._counts[channel] += 1
         self._gathered += len(data)
-        time_ns = self.clocks.ns(time_s)
+        time_ns = self.ns(time_s)
         self._writer.add_message(channel, time_ns, data, time_ns, self._counts[channel])
         if self._gathered > CHUNK_BYTES:
             self.flush()

@@ -29,7 +29,7 @@ from hil_tests.mastctl.recorder.recorder_world import (
     records,
 )  # fmt: skip
 from mastctl.recorder.recorded import repair
-from mastctl.recorder.writer import Clocks, RecordFile
+from mastctl.recorder.writer import RecordFile
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def small(path: Path) -> None:
     """A file of three chunks with nothing but numbers in it."""
-    file = RecordFile(path, [CONFIG], {"hardware": "simulated"}, Clocks(0.0, 10**18))
+    file = RecordFile(path, [CONFIG], {"hardware": "simulated"}, 0.0, 10**18)
     for number in range(30):
         file.add_json("/command", {"number": number}, 0.1 * number)
         if number % 10 == 9:
