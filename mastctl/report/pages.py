@@ -11,7 +11,6 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
@@ -57,24 +56,22 @@ class Badge:
     kind: str = ""
 
 
-def page(template: str | Path, **values: Any) -> str:
-    """Return a whole page from a file of ``templates``, or, by its path, one that builds on these.
+def page(template: str, **values: Any) -> str:
+    """Return a whole page from a file of ``templates``.
 
     Its head needs ``title``, ``badge`` (`Badge`) and ``facts`` (pairs of texts); the rest is the template's
     own.
     """
-    beside = None if isinstance(template, str) else template.parent
-    return _templates(beside).get_template(Path(template).name).render(**values)
+    return _templates().get_template(template).render(**values)
 
 
 @cache
-def _templates(beside: Path | None) -> Environment:
-    """The templates, and those of another folder, strict about unknown names."""
-    from jinja2 import ChoiceLoader, Environment, FileSystemLoader, PackageLoader, StrictUndefined
+def _templates() -> Environment:
+    """The templates, strict about unknown names."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    own = PackageLoader("mastctl.report")
     return Environment(
-        loader=own if beside is None else ChoiceLoader([FileSystemLoader(beside), own]),
+        loader=PackageLoader("mastctl.report"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -10,6 +10,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray, Rigid
@@ -53,22 +54,9 @@ class TrueAxis:
 
 @dataclass
 class CornerBench:
-    """A mast whose pictures are corners.
+    """A mast whose pictures are corners: ``head`` is what is believed, ``true_rig`` what is so.
 
-    Attributes
-    ----------
-    head
-        What is believed.
-    true_rig
-        What is so.
-    board
-        What stands there.
-    pan, tilt
-        The joints.
-    noise_px
-        Of a corner, each axis.
-    rover_from_board
-        Where the board stands now; None: nowhere.
+    ``noise_px`` is of a corner, each axis; ``rover_from_board`` where the board stands now, if anywhere.
     """
 
     head: BenchHead
@@ -81,13 +69,12 @@ class CornerBench:
     rover_from_board: Rigid | None = None
     seconds: float = 0.0
     looks: int = 0
-    pictures: int = 0
 
     def stand(self, placement: Placement) -> None:
         """Place the board where it is requested, as exactly as a person does: the same each time."""
         rng = np.random.default_rng(abs(hash(placement)))
         pose = placement.rover_from_board(self.true_rig.mast.rover_from_head(0.0, 0.0))
-        pose = pose @ Rigid(_small_turn(rng.normal(0.0, 0.08, 3)), np.zeros(3))
+        pose = pose @ Rigid(Rotation.from_rotvec(rng.normal(0.0, 0.08, 3)).as_matrix(), np.zeros(3))
         self.rover_from_board = Rigid(pose.rotation, pose.translation_m + rng.normal(0.0, 0.04, 3))
 
     def look(
@@ -108,7 +95,6 @@ class CornerBench:
         self.seconds += seconds
         self.looks += 1
         names = [name for name in self.head.rig.cameras if cameras is None or name in cameras]
-        self.pictures += len(names)
         seen = [self._seen(name, true_rad) for name in names]
         read = self.pan.read_rad, self.tilt.read_rad
         return BenchLook(tuple(seen), *read, self._side(self.pan), self._side(self.tilt))
@@ -159,9 +145,3 @@ class SelfPlacing:
         """Put the board there."""
         self.sentences.append(f"{name}: {placement}")
         self.bench.stand(placement)
-
-
-def _small_turn(rotvec: FloatArray) -> FloatArray:
-    from scipy.spatial.transform import Rotation
-
-    return np.asarray(Rotation.from_rotvec(rotvec).as_matrix())

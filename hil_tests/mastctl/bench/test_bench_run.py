@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.errors import CalibError
 from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
 from calib.plan.knowledge import BenchShot
@@ -122,13 +121,3 @@ def test_a_board_that_is_taken_away_ends_the_run_and_loses_nothing(repository: P
     with pytest.raises(BenchInterrupted, match="Put it back or place it anew"):
         run.run()
     assert len(list(looks_of(read_survey(tmp_path / "bench")))) == 5
-
-
-def test_a_folder_of_another_board_is_refused(repository: Path, tmp_path: Path) -> None:
-    bench = corner_bench(repository)
-    run_of(bench, tmp_path / "bench")
-    bench.noise_px = 0.11
-    with pytest.raises(
-        CalibError, match=r"sigma\.corner_px: is 0\.05, now it would be 0\.11; another folder"
-    ):
-        run_of(bench, tmp_path / "bench")

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -13,8 +17,9 @@ from calib.geometry.mode import SensorMode
 from calib.geometry.rig import AxisJoint, JointErrors
 from calib.plan.placements import Placement
 from calib.targets.boards import Charuco
+from hil_tests.waiting import until
 from mastctl.bench import mast as bench_mast
-from mastctl.bench.mast import BenchInterrupted, DaemonMast, NoLight, NotThere, SimulatedBoard
+from mastctl.bench.mast import BenchInterrupted, DaemonMast, NoLight, NotThere, SimulatedBoard, beside_goal
 from mastctl.bench.survey import survey_cameras
 from mastctl.client import Client
 from mastctl.config import Config, Listen, load_config
@@ -107,3 +112,73 @@ def test_pictures_in_the_dark_say_that_they_are_dark(client: Client, mast: Daemo
 def test_beyond_the_limits_nothing_is_looked_at_and_nothing_ends(mast: DaemonMast) -> None:
     with pytest.raises(NotThere):
         mast.look(3.0, 0.0)
+
+
+FAR_RAD = 2.0
+
+
+@pytest.fixture(scope="module")
+def url(repository: Path) -> Iterator[str]:
+    """A head that cannot arrive while a test runs: what is done once it turns is done in the middle."""
+    config = bench(repository)
+    simulation = {**config.hardware.simulation, "speed": 1.0}
+    limits = replace(config.limits, speed_rad_per_s=0.02)
+    config = replace(config, limits=limits, hardware=replace(config.hardware, simulation=simulation))
+    with RunningDaemon(config) as daemon:
+        yield daemon.url
+
+
+@contextmanager
+def in_the_move(url: str, act: Callable[[Client], object]) -> Iterator[DaemonMast]:
+    """The mast of a bench that steers; something is done as soon as the head turns."""
+
+    def wait_and_act() -> None:
+        with Client(url, name="Ana") as other:
+            until(lambda: other.status()["moving"], "the head turns")
+            act(other)
+
+    thread = threading.Thread(target=wait_and_act)
+    with Client(url, name="bench") as client, client.lease("calibrate bench", take_over="a test"):
+        mast = DaemonMast(client, CAMERAS[:1], BOARD)
+        thread.start()
+        yield mast
+        thread.join()
+
+
+@pytest.mark.parametrize(
+    ("act", "reason"),
+    [
+        (lambda ana: ana.stop(), "the head was stopped in the middle of a move: a stop was requested"),
+        (lambda ana: ana.estop(reason="a hand", name="Ana"), "an emergency stop"),
+        (lambda ana: ana.acquire_lease("Ana", take_over="it is needed"), "Ana took over: it is needed"),
+    ],
+    ids=["stop", "emergency stop", "taken over"],
+)
+def test_what_ends_a_move_is_named(url: str, act: Callable[[Client], object], reason: str) -> None:
+    with in_the_move(url, act) as mast, pytest.raises(BenchInterrupted, match=reason):
+        mast.look(FAR_RAD, 0.0)
+    with Client(url) as client:
+        if client.status()["estop"] is not None:
+            client.reset(reason="the hand is away", name="Ana")
+
+
+def test_ctrl_c_in_the_middle_of_a_move_leaves_no_head_behind_that_turns(url: str) -> None:
+    main = threading.main_thread().ident
+    assert main is not None
+    interrupt = partial(signal.pthread_kill, main, signal.SIGINT)
+    with in_the_move(url, lambda ana: interrupt()) as mast, pytest.raises(KeyboardInterrupt):
+        mast.look(FAR_RAD, 0.0)
+    with Client(url) as other:
+        until(lambda: not other.status()["moving"], "the head has come to rest")
+        joints = other.status()["joints"]
+    assert joints is not None and joints["pan_rad"] < FAR_RAD - 0.2
+
+
+def test_a_head_with_play_passes_through_it_from_the_side_with_room() -> None:
+    limits = (-1.0, 0.5)
+    for side in (0, 1):  # it comes from below anyway
+        assert beside_goal(0.2, -0.5, side, limits) == 0.2
+    assert beside_goal(0.2, 0.19, 0, limits) == pytest.approx(0.14)  # too near to have gone through the play
+    assert beside_goal(0.2, -0.5, -1, limits) == pytest.approx(0.26)
+    assert beside_goal(0.49, 0.3, -1, limits) == 0.49  # no room above: from below, where it comes from anyway
+    assert beside_goal(0.49, 0.48, -1, limits) == pytest.approx(0.43)
