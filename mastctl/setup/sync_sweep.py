@@ -18,10 +18,11 @@ import numpy as np
 
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
+from calib.matching.patch import peaks
 from calib.matching.warp import Grey, grey, summit
 from drivers.clock import Clock
 from drivers.errors import NoReply
-from drivers.interfaces import Camera, Frame, Image, Reading
+from drivers.interfaces import Camera, Image, Reading
 from mastctl.devices.devices import Devices
 from mastctl.devices.judge import Limits
 from mastctl.setup.sync_fit import REACH_S, CannotTell, JointMotion, OffsetFit, fit_offset
@@ -35,6 +36,7 @@ USUAL_SPEED = 5.0  # amplitudes a second
 READ_EVERY_S = 0.005
 REST_S = REACH_S + 0.4  # before the picture at rest: also one that is stamped too new shows the rest
 ARRIVE_S = 10.0
+BEGUN_S = 0.05  # a reading so long after a move shows it
 FRAME_TIMEOUT_S = 5.0
 END_S = FRAME_TIMEOUT_S + 1.0  # beyond it a driver that should have answered hangs
 LOST_FRAMES = 3
@@ -82,19 +84,12 @@ def plan_sweep(
 ) -> SweepPlan:
     """Return a sweep that the cameras' views allow, as far as it was not requested otherwise."""
     if amplitude_rad is None:
-        narrowest = min(_view_rad(rig, name) for name in cameras)
+        models = [rig.cameras[name].model for name in cameras]
+        narrowest = min(2 * math.atan(one.size_px[0] / 2 / one.focal_px[0]) for one in models)
         amplitude_rad = min(USUAL_AMPLITUDE_RAD, MOST_OF_VIEW * narrowest)
     if speed_rad_per_s is None:
         speed_rad_per_s = min(USUAL_SPEED * amplitude_rad, limits.speed_rad_per_s)
     return SweepPlan(amplitude_rad, speed_rad_per_s, seconds)
-
-
-def _view_rad(rig: Rig, camera: str) -> float:
-    """How wide a camera sees along its middle row."""
-    model = rig.cameras[camera].model
-    width, height = model.size_px
-    ends = model.ray(np.array([[0.0, (height - 1) / 2], [width - 1.0, (height - 1) / 2]])).directions
-    return float(np.arccos(np.clip(ends[0] @ ends[1], -1.0, 1.0)))
 
 
 class Sweep:
@@ -126,7 +121,7 @@ class Sweep:
         Raises OutsideLimits and KeptOut before anything moves, if the sweep would pass a limit or a keep-out;
         DriverError if the head fails: it is at rest then.
         """
-        self._rest()
+        self._rest("the head does not come to rest", REST_S)
         start = self._devices.read()
         for side in (-1, 1):
             goal = start.pan_rad + side * plan.amplitude_rad, start.tilt_rad
@@ -212,16 +207,17 @@ class Sweep:
             self._readings.append(reading)
         return reading
 
-    def _rest(self) -> None:
-        """Wait until the head has been at rest for long enough."""
-        since_s = self._clock.now_s()
-        until_s = since_s + ARRIVE_S
-        while self._clock.now_s() - since_s < REST_S:
-            if self._note().moving:
-                since_s = self._clock.now_s()
-            if self._clock.now_s() > until_s:
-                raise NoReply("the head does not come to rest", device="pan_tilt")
+    def _rest(self, message: str, rest_s: float = 0.0) -> None:
+        """Record readings until the head has been at rest for some time. Raises NoReply."""
+        began_s = since_s = self._clock.now_s()
+        while self._clock.now_s() - began_s <= ARRIVE_S:
+            reading, now_s = self._note(), self._clock.now_s()
+            if reading.moving or reading.time_s <= began_s + BEGUN_S:
+                since_s = now_s
+            elif now_s - since_s >= rest_s:
+                return
             self._clock.sleep(READ_EVERY_S)
+        raise NoReply(message, device="pan_tilt")
 
     def _to_and_fro(self, start: Reading, plan: SweepPlan) -> int:
         """Turn for the plan's time, and return how many ways that made: no more than any camera sees."""
@@ -236,14 +232,7 @@ class Sweep:
     def _go(self, pan_rad: float, tilt_rad: float, speed_rad_per_s: float) -> None:
         """Go there, and record readings until the head is at rest."""
         self._devices.move(pan_rad, tilt_rad, speed_rad_per_s)
-        sent_s = self._clock.now_s()
-        while True:
-            reading = self._note()
-            if reading.time_s > sent_s + 0.05 and not reading.moving:
-                return
-            if self._clock.now_s() - sent_s > ARRIVE_S:
-                raise NoReply(f"the head does not come to pan {pan_rad:.3f} rad", device="pan_tilt")
-            self._clock.sleep(READ_EVERY_S)
+        self._rest(f"the head does not come to pan {pan_rad:.3f} rad")
 
     def _choose(self, start: Reading, plan: SweepPlan, name: str) -> None:
         """Take a camera's image at rest and choose what to follow in it; its failure is in `seen`."""
@@ -259,30 +248,26 @@ class Sweep:
     def _follow(self, name: str) -> None:
         """Find a camera's patches in what comes."""
         seen, camera = self.seen[name], self._cameras[name]
+        assert seen.patches is not None
         lost, after_s = 0, self._clock.now_s()
         while not self._over.is_set():
             try:
                 frame = camera.next_frame(after_s, FRAME_TIMEOUT_S)
-                self._take(seen, frame)
-                after_s, lost = max(after_s, frame.mid_exposure_s - frame.exposure_s / 2), 0
+                stamp_s = float(frame.mid_exposure_s)
+                seen.came_after_s = min(seen.came_after_s, self._clock.now_s() - stamp_s)
+                if seen.stamps_s and stamp_s <= seen.stamps_s[-1]:
+                    self._clock.sleep(0.002)  # the same one again
+                    continue
+                seen.places_px.append(seen.patches.places_px(frame.image))
+                seen.stamps_s.append(stamp_s)
+                seen.uncertainty_s = float(getattr(frame, "mid_uncertainty_s", 0.0))
+                after_s, lost = max(after_s, stamp_s - frame.exposure_s / 2), 0
             except Exception as error:  # a foreign driver may raise anything
                 lost += 1
                 if lost == LOST_FRAMES and not self._over.is_set():
                     seen.failure = str(error) or type(error).__name__
                     return
                 self._clock.sleep(0.05)
-
-    def _take(self, seen: Sightings, frame: Frame) -> None:
-        assert seen.patches is not None
-        stamp_s = float(frame.mid_exposure_s)
-        seen.came_after_s = min(seen.came_after_s, self._clock.now_s() - stamp_s)
-        if seen.stamps_s and stamp_s <= seen.stamps_s[-1]:
-            self._clock.sleep(0.002)  # the same one again
-            return
-        places_px = seen.patches.places_px(frame.image)
-        seen.uncertainty_s = float(getattr(frame, "mid_uncertainty_s", 0.0))
-        seen.stamps_s.append(stamp_s)
-        seen.places_px.append(places_px)
 
 
 HALF_PX = 15
@@ -318,16 +303,16 @@ class Patches:
     def _place_px(self, picture: Grey, number: int) -> float:
         x0, y0, x1, y1 = self.windows_px[number].astype(int)
         part = picture[y0 - HALF_PX : y1 + HALF_PX + 1, x0 - HALF_PX : x1 + HALF_PX + 1]
-        score = cv2.matchTemplate(part, self.templates[number], cv2.TM_CCOEFF_NORMED)
-        _, best, _, (x, y) = cv2.minMaxLoc(score)
+        found = cv2.matchTemplate(part, self.templates[number], cv2.TM_CCOEFF_NORMED)
+        score = np.asarray(found, np.float32)
+        (x, y), best, second = peaks(score, APART_PX)
         height, width = score.shape
-        if best < LEAST_CORRELATION or not (0 < x < width - 1 and 0 < y < height - 1):
+        if best < max(LEAST_CORRELATION, second + LEAST_LEAD):
+            return np.nan
+        if not (0 < x < width - 1 and 0 < y < height - 1):
             return np.nan
         offset = np.array([summit(*score[y, x - 1 : x + 2]), summit(*score[y - 1 : y + 2, x])])
         place = np.array([x0 + x, y0 + y]) + offset - self.centres_px[number]
-        score[max(0, y - APART_PX) : y + APART_PX + 1, max(0, x - APART_PX) : x + APART_PX + 1] = -1.0
-        if best - float(score.max()) < LEAST_LEAD:
-            return np.nan
         return float(place @ self.ways[number])
 
 
