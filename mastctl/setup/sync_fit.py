@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
+from scipy.interpolate import make_smoothing_spline
 
 from calib.geometry.rigid import FloatArray
 from mastctl.errors import MastctlError
@@ -28,7 +28,6 @@ LEAST_REVERSAL_RAD = 5e-4
 LEAST_WAY_RAD = 0.010  # after a turn back: until then the gears of a plain servo are not all on one side
 LARGEST_GAP_S = 0.1  # between the readings around a frame; beyond it the angle is a guess
 LEAST_SPEED_RAD_PER_S = 0.06
-SMOOTHING_S = 0.065  # readings so far to either side even each other out; short beside a ramp of the speed
 
 REACH_S = 0.6
 """How far off a camera's stamps are searched, seconds either way."""
@@ -65,7 +64,7 @@ class JointMotion:
         self._turns, self._signs = _legs(self.angles_rad)
         low, high = float(self.angles_rad.min()), float(self.angles_rad.max())
         self.span = (low + high) / 2, max((high - low) / 2, 1e-9)
-        self._curve = _smoothed(self.times_s, self.angles_rad)
+        self._curve = make_smoothing_spline(self.times_s, self.angles_rad)
         self._speed = self._curve.derivative()
 
     def at(self, times_s: FloatArray) -> FloatArray:
@@ -87,20 +86,6 @@ class JointMotion:
         sure &= np.abs(self.slope(times_s)) >= LEAST_SPEED_RAD_PER_S  # one at rest does not depend on time
         sure &= np.abs(self.at(times_s) - self.angles_rad[self._turns[known]]) >= LEAST_WAY_RAD
         return np.where(sure, leg, -1), self._signs[known]
-
-
-def _smoothed(times_s: FloatArray, angles_rad: FloatArray) -> CubicHermiteSpline:
-    """A curve with, at each reading, the place and speed of the parabola that fits its neighbours best."""
-    place, speed = np.empty(len(times_s)), np.empty(len(times_s))
-    first = np.searchsorted(times_s, times_s - SMOOTHING_S)
-    last = np.searchsorted(times_s, times_s + SMOOTHING_S, side="right")
-    for number, (begin, end) in enumerate(zip(first, last, strict=True)):
-        if end - begin < 4:
-            begin, end = max(0, number - 2), min(len(times_s), number + 3)
-        since_s = times_s[begin:end] - times_s[number]
-        parabola = np.linalg.lstsq(np.vander(since_s, 3), angles_rad[begin:end], rcond=None)[0]
-        place[number], speed[number] = parabola[2], parabola[1]
-    return CubicHermiteSpline(times_s, place, speed)
 
 
 def _legs(angles_rad: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
