@@ -11,7 +11,7 @@ from urllib.parse import quote
 
 from mastctl.cli import output
 from mastctl.cli.daemon import CONFIG, DAEMON, URL, client_of
-from mastctl.cli.options import GROUPS, Option, angle_rad, command, finite_number, option
+from mastctl.cli.options import GROUPS, Option, command, finite_number, option
 from mastctl.cli.output import Answer, CommandError, WrongUse, tables_at
 
 if TYPE_CHECKING:
@@ -204,7 +204,7 @@ for _one in REQUESTS:
     command(_one.name, *_one.options, *DAEMON, help=_one.help, example=_one.example)(_one.run)
 
 
-TOKEN = (URL, CONFIG, option("--state FOLDER", "state folder of a daemon that does not run now"))
+TOKEN = (URL, CONFIG)
 
 
 @command(
@@ -238,58 +238,31 @@ def _revoke(args: argparse.Namespace) -> Answer:
 
 
 def _tokens(args: argparse.Namespace) -> TokenList:
-    """The list that the daemon reads."""
-    from mastctl.http.tokens import LIST_NAME, TokenList
-
-    folder = args.state or _folder_of_running(args)
-    if args.state is not None and not (folder / LIST_NAME).exists():
-        missing = "no daemon has kept its state here that requires tokens; its first run makes them"
-        raise output.unusable(str(folder), missing)
-    owner = folder.stat().st_uid
-    if owner != os.geteuid():  # what root writes there the daemon could not read
-        message = f"{folder} belongs to user {owner}: sudo -u '#{owner}' mastctl rig token ..."
-        raise CommandError("another_user", message)
-    return TokenList(folder)
-
-
-def _folder_of_running(args: argparse.Namespace) -> Path:
-    """Where the running daemon reads tokens."""
-    from mastctl.client import ClientError
+    """The list that the daemon reads: only a running one knows where."""
+    from mastctl.http.tokens import TokenList
 
     with client_of(args) as client:
-        try:
-            folder = client.request("GET", "/health/live").get("token_folder")
-        except ClientError as error:
-            if error.code != "no_daemon":
-                raise
-            message = (
-                f"no daemon answers at {client.url}, and only a running one knows where it reads its tokens: "
-                "start it, or name the folder of one that has run by --state FOLDER"
-            )
-            raise CommandError(error.code, message) from None
+        folder = client.request("GET", "/health/live").get("token_folder")
     if folder is None:
         message = f"the daemon at {client.url} requires no token, or is on another machine: make it there"
         raise CommandError("no_tokens", message)
-    return Path(folder)
+    owner = Path(folder).stat().st_uid
+    if owner != os.geteuid():  # what root writes there the daemon could not read
+        message = f"{folder} belongs to user {owner}: sudo -u '#{owner}' mastctl rig token ..."
+        raise CommandError("another_user", message)
+    return TokenList(Path(folder))
 
 
 FOLDER = option("--folder DIR", "the folder of references and results", required=True)
 
 
-def _pose(text: str) -> tuple[float, float]:
-    angles = text.split(",")
-    if len(angles) != 2:
-        raise argparse.ArgumentTypeError(f"'{text}' where PAN,TILT in radians is expected")
-    return angle_rad(angles[0]), angle_rad(angles[1])
-
-
 @command(
     "rig sentinel reference",
-    option("--pose PAN,TILT", "a pose, radians (default: six)", type=_pose, repeat=True),
+    option("--pose PAN TILT", "a pose, radians; may be repeated (default: six)", repeat=True),
     FOLDER,
     *DAEMON,
     help="take the reference images",
-    example="--folder sentinel --pose 0,-0.3",
+    example="--folder sentinel --pose 0 -0.3",
 )
 def _reference(args: argparse.Namespace) -> Answer:
     from mastctl.drift.looks import head_cameras, steering, take_pictures, usual_rests

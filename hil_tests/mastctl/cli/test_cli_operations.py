@@ -1,4 +1,4 @@
-"""Operations, events, mast file and faults on the command line; an example each."""
+"""Operations, events, mast file and lease on the command line; an example of each command."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from calib.files.mast_file import save_rig
+from hil_tests.mastctl.cli.conftest import Run
 from hil_tests.mastctl.service_fakes import FakeHardware, rig
 from mastctl.cli.main import _joined, build_parser, main
 from mastctl.cli.options import DECLARED
@@ -19,6 +20,7 @@ from mastctl.client import Client
 from mastctl.daemon import RunningDaemon
 
 BOTH = tuple[RunningDaemon, FakeHardware]
+ANGLES = ("--angles", "0.1", "-0.1")
 
 
 @pytest.fixture
@@ -29,43 +31,25 @@ def operation(pair: BOTH) -> str:
     return found
 
 
-def said(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    assert main(words) == 0, capsys.readouterr().err
-    return capsys.readouterr().out
-
-
-def test_operations_are_listed_shown_and_watched(
-    pair: BOTH, operation: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    url = pair[0].url
-    table = said(capsys, "status", "--operations", "--url", url)
+def test_operations_are_listed_shown_and_watched(run: Run, operation: str) -> None:
+    table = run("status", "--operations")[1]
     assert operation in table and "pan rad 0.25" in table and "0.25, -0.5" in table
-    shown = said(capsys, "status", "--operation", operation, "--url", url)
+    shown = run("status", "--operation", operation)[1]
     assert operation in shown and "look" in shown and "measure" in shown and "done" in shown
-    assert (
-        json.loads(said(capsys, "status", "--operation", operation, "--wait", "60", "--url", url, "--json"))[
-            "id"
-        ]
-        == operation
-    )
-    line = said(capsys, "status", "--events", "operation", "--count", "1", "--url", url)
+    code, out, _ = run("status", "--operation", operation, "--wait", "60", "--json")
+    assert (code, json.loads(out)["id"]) == (0, operation)
+    line = run("status", "--events", "operation", "--count", "1")[1]
     assert line.startswith(f"operation {operation}: state done, request pan rad 0.25, tilt rad -0.5")
-    assert main(["status", "--operation", "nothing", "--url", url]) == 2
-    assert "operation nothing is not known" in capsys.readouterr().err
+    code, _, log = run("status", "--operation", "nothing")
+    assert code == 2 and "operation nothing is not known" in log
 
 
-def test_events_are_a_line_each(pair: BOTH, operation: str, capsys: pytest.CaptureFixture[str]) -> None:
-    url = pair[0].url
-    assert (
-        said(capsys, "status", "--events", "state", "--count", "1", "--url", url)
-        == "state machine: state ready\n"
-    )
-    told = said(
-        capsys, "status", "--events", "operation", "mast", "--count", "2", "--url", url, "--json"
-    ).splitlines()
-    assert {json.loads(line)["topic"] for line in told} == {"operation", "mast"}
-    assert main(["status", "--events", "weather", "--url", url]) == 2
-    assert "'weather' where some of" in capsys.readouterr().err
+def test_events_are_a_line_each(run: Run, operation: str) -> None:
+    assert run("status", "--events", "state", "--count", "1")[1] == "state machine: state ready"
+    shown = run("status", "--events", "operation", "mast", "--count", "2", "--json")[1].splitlines()
+    assert {json.loads(line)["topic"] for line in shown} == {"operation", "mast"}
+    code, _, log = run("status", "--events", "weather")
+    assert code == 2 and "'weather' where some of" in log
 
 
 @pytest.mark.parametrize(
@@ -82,14 +66,34 @@ def test_options_of_another_use_are_refused(
     assert message in capsys.readouterr().err
 
 
-def test_the_mast_file_is_replaced_and_put_back(
-    pair: BOTH, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    url = ("--url", pair[0].url)
+def test_the_mast_file_is_replaced_and_put_back(run: Run, tmp_path: Path) -> None:
     save_rig(rig(), tmp_path / "other.yaml")
-    assert said(capsys, "rig", "mast", "use", "other.yaml", *url).startswith("other.yaml (little")
-    assert "before other.yaml" in said(capsys, "rig", "mast", "back", *url)
-    assert main(["rig", "mast", "use", "none.yaml", *url]) == 2
+    assert run("rig", "mast", "use", "other.yaml")[1].startswith("other.yaml (little")
+    assert "before other.yaml" in run("rig", "mast", "back")[1]
+    assert run("rig", "mast", "use", "none.yaml")[0] == 2
+
+
+def test_a_lease_is_taken_used_shown_and_released(run: Run) -> None:
+    assert "control" in run("rig", "lease", "show")[1]
+    code, lease, _ = run("rig", "lease", "take", "--for", "600", "--name", "night shift")
+    assert (code, len(lease)) == (0, 32)
+    assert "night shift" in run("rig", "lease", "show")[1]
+    assert "night shift" in run("status")[1]
+    code, out, _ = run("point", *ANGLES, "--json")
+    assert (code, json.loads(out)["error"]["code"]) == (1, "leased")
+    assert run("point", *ANGLES, "--lease", lease, "--json")[0] == 0
+    assert run("rig", "lease", "release", "--lease", lease)[:2] == (0, "released")
+    code, out, _ = run("rig", "lease", "release", "--lease", lease, "--json")
+    assert (code, json.loads(out)["error"]["code"]) == (1, "lease_over")
+
+
+def test_taking_over_needs_a_reason(run: Run, pair: BOTH) -> None:
+    with Client(pair[0].url, name="bench") as client, client.lease():
+        code, out, _ = run("rig", "lease", "take", "--json")
+        assert (code, json.loads(out)["error"]["code"]) == (1, "leased")
+        code, lease, _ = run("rig", "lease", "take", "--reason", "the bench is empty")
+        assert code == 0
+        assert run("point", *ANGLES, "--lease", lease)[0] == 0
 
 
 def leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:

@@ -6,7 +6,6 @@ import json
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,30 +14,13 @@ import numpy as np
 import pytest
 
 from drivers.errors import NoReply
+from hil_tests.mastctl.cli.conftest import Run
 from hil_tests.mastctl.service_fakes import FakeHardware, ScriptedLoop
 from hil_tests.waiting import NET_S
 from mastctl.cli.main import main
 from mastctl.daemon import RunningDaemon
 
 BOTH = tuple[RunningDaemon, FakeHardware]
-Run = Callable[..., tuple[int, str, str]]
-
-
-def runs(url: str, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run a command against a daemon: exit code, stdout, stderr."""
-
-    def call(*words: str) -> tuple[int, str, str]:
-        capsys.readouterr()
-        code = main([*words, "--url", url])
-        out, log = capsys.readouterr()
-        return code, out, log
-
-    return call
-
-
-@pytest.fixture
-def run(pair: BOTH, capsys: pytest.CaptureFixture[str]) -> Run:
-    return runs(pair[0].url, capsys)
 
 
 def document(result: tuple[int, str, str], code: int = 0) -> dict[str, Any]:
@@ -88,17 +70,8 @@ def test_point_in_each_of_its_forms(
     frame_id = shot["frame_id"]
     forms = {
         "pixel": (
-            "--pixel",
-            "navcam_left",
-            frame_id,
-            "3.5",
-            "4",
-            "--aim",
-            "navcam_right",
-            "1",
-            "2",
-            "--pointings",
-            "2",
+            *("--pixel", "navcam_left", frame_id, "3.5", "4"),
+            *("--aim", "navcam_right", "1", "2", "--pointings", "2"),
         ),
         "fresh": ("--camera", "navcam_left", "--at", "5", "6"),
         "position": ("--position", "6", "-1e-1", "0.1", "--frame", "site"),
@@ -139,35 +112,25 @@ def test_a_failed_operation_ends_with_1_and_its_reason(run: Run, monkeypatch: py
         (("point", "--angles", "0", "nan"), "wrong_use"),
         (("point", "--pixel", "navcam_left", "f", "1", "2"), "frame_unknown"),
         (("snapshot", "navcam_left", "--out", "no/such/folder/x.png"), "file_system"),
-        (("status", "--config", "nowhere.yaml", "--url", "mars"), "bad_url"),
     ],
 )
 def test_wrong_use_and_bad_input_end_with_2(
-    standing: BOTH,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    words: tuple[str, ...],
-    code: str,
+    run: Run, pair: BOTH, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, words: tuple[str, ...], code: str
 ) -> None:
-    run = runs(standing[0].url, capsys)
     monkeypatch.chdir(tmp_path)
-    if "mars" in words:
-        assert main([*words, "--json"]) == 2
-        return
     assert error_of(run(*words, "--json"), 2)["code"] == code
     exit_code, out, log = run(*words)
     assert (exit_code, out) == (2, "")
     assert log.startswith("mastctl: ")
     assert log.count("\n") == 1
-    assert [call for call in standing[1].head.calls if call[0] == "move"] == []
+    assert [call for call in pair[1].head.calls if call[0] == "move"] == []
 
 
 def test_stop_tells_what_it_stopped(run: Run, pair: BOTH) -> None:
     told = document(run("stop", "--json"))
     reached = told.pop("reached")
     assert told == {"stopped": True, "operation": None}
-    assert run("stop")[:2] == (0, f"stopped at {reached}\n")
+    assert run("stop")[:2] == (0, f"stopped at {reached}")
     assert pair[1].head.calls == [("stop",), ("stop",)]
 
 

@@ -13,7 +13,6 @@ from hil_tests.mastctl.web.network import Network, network_daemon
 from hil_tests.waiting import until
 from mastctl.cli.main import main
 from mastctl.client import Client, ClientError
-from mastctl.http.tokens import TokenList
 
 
 @pytest.fixture
@@ -26,13 +25,6 @@ def net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Network]:
         yield made
 
 
-@pytest.fixture
-def kept(tmp_path: Path) -> Path:
-    """The state folder of a daemon that has run and has ended."""
-    TokenList(tmp_path).first_run()
-    return tmp_path
-
-
 def test_a_token_is_made_where_the_running_daemon_reads_it(
     net: Network, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -41,9 +33,13 @@ def test_a_token_is_made_where_the_running_daemon_reads_it(
     assert "wall" in [one.name for one in net.tokens.read() or ()]
     assert not (tmp_path / "user").exists()
     assert main(["rig", "token", "list", "--json"]) == 0
-    assert "wall" in [one["name"] for one in json.loads(capsys.readouterr().out)["tokens"]]
+    shown = capsys.readouterr().out
+    assert "wall" in [one["name"] for one in json.loads(shown)["tokens"]]
+    assert token not in shown and all(one.sha256 not in shown for one in net.tokens.read() or ())
     with Client(net.url, token=token) as client:
         until(lambda: admitted(client), "the daemon to know the token")
+    assert main(["rig", "token", "revoke", "wall"]) == 0
+    assert "wall" not in [one.name for one in net.tokens.read() or ()]
 
 
 def admitted(client: Client) -> bool:
@@ -64,32 +60,8 @@ def test_a_configuration_of_no_running_daemon_makes_no_token(
     for words in (["new", "--name", "wall", "--role", "view"], ["list"], ["revoke", "wall"]):
         assert main(["rig", "token", *words, "--config", str(config)]) != 0
         said = capsys.readouterr().err
-        assert "no daemon answers at http://127.0.0.1:1" in said and "--state FOLDER" in said
+        assert "no daemon answers at http://127.0.0.1:1" in said
     assert not (tmp_path / "user").exists()
-
-
-def test_a_token_is_made_listed_and_revoked_in_a_folder_that_a_daemon_kept(
-    kept: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    there = ["--state", str(kept)]
-    assert main(["rig", "token", "new", "--name", "wall", "--role", "view", *there]) == 0
-    text = capsys.readouterr().out.strip()
-    assert len(text) == 43
-    assert main(["rig", "token", "list", "--json", *there]) == 0
-    shown = capsys.readouterr().out
-    assert "wall" in [one["name"] for one in json.loads(shown)["tokens"]]
-    listed = TokenList(kept).read()
-    assert listed is not None and text not in shown and listed[-1].sha256 not in shown
-    assert main(["rig", "token", "revoke", "wall", *there]) == 0
-    assert [one.name for one in TokenList(kept).read() or ()] == ["view", "operate", "admin"]
-
-
-def test_a_folder_that_no_daemon_kept_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for words in (["new", "--name", "wall", "--role", "view"], ["list"], ["revoke", "wall"]):
-        for folder in (tmp_path, tmp_path / "nowhere"):
-            assert main(["rig", "token", *words, "--state", str(folder)]) == 2
-            assert f"{folder}: no daemon has kept its state here" in capsys.readouterr().err
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_command_without_its_token_is_referred_to_the_variable(

@@ -27,7 +27,7 @@ Run = Callable[..., tuple[int, str, str]]
 def daemon(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[RunningDaemon]:
     with small_rover(repository, tmp_path_factory.mktemp("sentinel")) as made:
         folder = made.service.folder.path / "sentinel"
-        rests = [f"--pose={rest}" for rest in RESTS]
+        rests = [word for rest in RESTS for word in ("--pose", *rest.split(","))]
         assert main(["rig", "sentinel", "reference", "--folder", str(folder), "--url", made.url, *rests]) == 0
         yield made
 
