@@ -51,9 +51,10 @@ LONGEST_LINE = 16384
 class Command:
     """A kind of command: its name in the record, the role that its caller needs, its need of the state.
 
-    ``steers``: it is refused while another client steers. ``goes_on``: with an ``id`` it keeps an operation
-    going, and is recorded only if it is refused. ``grants``: its answer has a lease's id, which proves the
-    lease: never by a key of an anonymous client, and never of a lease that has ended.
+    ``steers``: it is refused while another client steers; a fact about rover, sun or board is not.
+    ``goes_on``: with an ``id`` it keeps an operation going, and is recorded only if it is refused.
+    ``grants``: its answer has a lease's id, which proves the lease: never by a key of an anonymous client,
+    and never of a lease that has ended.
     """
 
     name: str
@@ -64,44 +65,8 @@ class Command:
     grants: bool = False
 
 
-POINT = Command("point", steers=True, need="motion")
-JOG = Command("jog", steers=True, goes_on=True)
-TRACK = Command("track", steers=True, need="track")
-TRACK_LOOK = Command("track.look", steers=True, need="motion")
-TRACK_STOP = Command("track.stop", steers=True)
-MAST = Command("mast", steers=True)  # the service checks whether the head is at rest, after reading it
-MAST_BACK = Command("mast.back", steers=True)
-CAMERA_SETTINGS = Command("camera.settings", steers=True, need="idle")
-POSE = Command("pose")  # a fact about the rover; the track that uses it has its own holder
-SUN = Command("limits.sun")  # a fact too
-SUN_FORGET = Command("limits.sun.forget")
 STOP = Command("stop", "view")
 ESTOP = Command("estop", "view")
-OPERATION_STOP = Command("operation.stop")  # of that one only: the client that steers by now is left alone
-RESET = Command("reset", need="latch")
-RECORD_START = Command("record.start")
-RECORD_STOP = Command("record.stop")
-RECORD_DELETE = Command("record.delete", "admin")  # of a fault, the evidence
-PLACE_KEEP = Command("place.keep")
-PLACE_FORGET = Command("place.forget")
-TARGET_KEEP = Command("target.keep")
-TARGET_FORGET = Command("target.forget")
-PANORAMA = Command("panorama", steers=True, need="motion")
-PANORAMA_DELETE = Command("panorama.delete", "admin")
-BENCH = Command("bench", steers=True, need="track")
-BENCH_STANDS = Command("bench.stands")  # a fact about the board
-BENCH_LEAVE = Command("bench.leave")
-BENCH_FORGET = Command("bench.forget")
-LEASE = Command("lease", grants=True)
-LEASE_RENEW = Command("lease.renew", grants=True)
-LEASE_RELEASE = Command("lease.release")
-LEASE_TAKE = Command("lease.take", grants=True)
-SIMULATION_POSE = Command("simulation.pose")  # acts on the world, not on the head
-SIMULATION_TIME = Command("simulation.time")
-SIMULATION_BOARD = Command("simulation.board")
-SIMULATION_BOARD_GONE = Command("simulation.board_gone")
-SIMULATION_FAULT = Command("simulation.fault")
-SIMULATION_FAULTS_OFF = Command("simulation.faults_off")
 
 
 @dataclass(frozen=True)

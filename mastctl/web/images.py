@@ -22,7 +22,7 @@ from calib.geometry.mode import flip_name
 from drivers.interfaces import SETTINGS
 from mastctl.answers import CameraSettingsAnswer
 from mastctl.as_json import as_json
-from mastctl.control.entry import CAMERA_SETTINGS
+from mastctl.control.entry import Command
 from mastctl.frame_facts import described_headers, headers_of
 from mastctl.http import PREFIX
 from mastctl.motion.requests import Name, StrictBody
@@ -117,7 +117,7 @@ def add_cameras(app: FastAPI) -> None:
         here.service.check_camera(camera)
         return await here.waiting.run(lambda: _settings(here, camera, []))
 
-    @command(app, "PATCH /cameras/{camera}/settings", CAMERA_SETTINGS)
+    @command(app, "PATCH /cameras/{camera}/settings", Command("camera.settings", steers=True, need="idle"))
     def change(camera: str, body: CameraSettingsBody, here: Here) -> CameraSettingsAnswer:
         """Change some of a camera's settings, each with its automatic turned off."""
         return _settings(here, camera, here.service.devices.change_settings(camera, body.wanted))

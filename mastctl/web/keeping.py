@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from mastctl import answers
 from mastctl.as_json import readable
 from mastctl.bench.runs import NAME
-from mastctl.control import entry
+from mastctl.control.entry import Command
 from mastctl.http import PREFIX
 from mastctl.motion.requests import Angle, Name, StrictBody
 from mastctl.service.masts import MastInUse, Masts
@@ -93,13 +93,13 @@ def add_masts(app: FastAPI) -> None:
             headers={"Mastctl-Mast-Digest": in_use.stored.digest},
         )
 
-    @command(app, "POST /mast", entry.MAST)
+    @command(app, "POST /mast", Command("mast", steers=True))
     def load_mast(body: MastBody, here: Here) -> answers.MastChange:
         """Use another mast file from now on."""
         masts = here.service.masts
         return _mast_change(masts, masts.load(body.file))
 
-    @command(app, "POST /mast/back", entry.MAST_BACK)
+    @command(app, "POST /mast/back", Command("mast.back", steers=True))
     def back(here: Here) -> answers.MastChange:
         """Go back to the former mast file."""
         masts = here.service.masts
@@ -118,12 +118,12 @@ def add_places(app: FastAPI) -> None:
     async def places(here: Here) -> answers.PlaceList:
         return {"places": await here.waiting.run(here.service.places.all)}
 
-    @command(app, "POST /places/{name}", entry.PLACE_KEEP)
+    @command(app, "POST /places/{name}", Command("place.keep"))
     def keep(name: PlaceName, body: PlaceBody, here: Here) -> answers.PlaceList:
         """Keep a place by a name."""
         return {"places": here.service.places.keep(name, body.model_dump())}
 
-    @command(app, "DELETE /places/{name}", entry.PLACE_FORGET)
+    @command(app, "DELETE /places/{name}", Command("place.forget"))
     def forget(name: PlaceName, here: Here) -> answers.PlaceList:
         """Forget a place; a forgotten home is 0, 0 again."""
         return {"places": here.service.places.forget(name)}
@@ -136,12 +136,12 @@ def add_recordings(app: FastAPI) -> None:
     async def recordings(here: Here) -> answers.Recordings:
         return await here.waiting.run(here.service.recorder.listing)
 
-    @command(app, "POST /recordings/start", entry.RECORD_START)
+    @command(app, "POST /recordings/start", Command("record.start"))
     def start(body: RecordBody, here: Here) -> answers.RecorderState:
         """Record until it is ended, or there is no room left."""
         return here.service.recorder.start_run(body.name)
 
-    @command(app, "POST /recordings/stop", entry.RECORD_STOP)
+    @command(app, "POST /recordings/stop", Command("record.stop"))
     def stop(here: Here) -> answers.RecordingEnded:
         """End the recording that was begun."""
         return here.service.recorder.stop_run()
@@ -156,7 +156,7 @@ def add_recordings(app: FastAPI) -> None:
         path = await here.waiting.run(lambda: here.service.recorder.file(name, file))
         return FileResponse(path, media_type="application/octet-stream", filename=readable(path.name))
 
-    @command(app, "DELETE /recordings/{name}", entry.RECORD_DELETE)
+    @command(app, "DELETE /recordings/{name}", Command("record.delete", "admin"))
     def delete(name: str, here: Here) -> answers.RecordingDeleted:
         """Delete a run, or what was kept at a fault."""
         return here.service.recorder.delete(name)
@@ -169,23 +169,23 @@ def add_bench(app: FastAPI) -> None:
     async def bench(here: Here) -> answers.BenchRuns:
         return await here.waiting.run(here.service.bench.answer)
 
-    @command(app, "POST /bench", entry.BENCH, status_code=202)
+    @command(app, "POST /bench", Command("bench", steers=True, need="track"), status_code=202)
     def begin(body: BenchBody, here: Here, requested: Requested) -> answers.BenchAnswer:
         """Begin a bench calibration, or go on with one."""
         bench = here.service.bench
         return {"run": bench.start(requested.caller.name, requested.last_stop, **body.model_dump())}
 
-    @command(app, "POST /bench/stands", entry.BENCH_STANDS)
+    @command(app, "POST /bench/stands", Command("bench.stands"))
     def stands(here: Here) -> answers.BenchAnswer:
         """Confirm that the board stands where it is requested."""
         return {"run": here.service.bench.stands()}
 
-    @command(app, "POST /bench/leave", entry.BENCH_LEAVE, beside=True)
+    @command(app, "POST /bench/leave", Command("bench.leave"), beside=True)
     def leave(here: Here, requested: Requested) -> answers.BenchAnswer:
         """End the bench calibration; it can go on later."""
         return {"run": here.service.bench.leave(requested.caller.name)}
 
-    @command(app, "DELETE /bench/runs/{name}", entry.BENCH_FORGET)
+    @command(app, "DELETE /bench/runs/{name}", Command("bench.forget"))
     def forget(name: RunName, here: Here) -> answers.BenchRuns:
         """Remove a bench calibration that is over, pictures and report."""
         return here.service.bench.forget(name)

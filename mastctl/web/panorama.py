@@ -9,7 +9,7 @@ from fastapi.responses import FileResponse, Response
 from pydantic import Field, model_validator
 
 from mastctl.answers import PanoramaDrawn, PanoramaList, Started, TargetList
-from mastctl.control.entry import PANORAMA, PANORAMA_DELETE, TARGET_FORGET, TARGET_KEEP
+from mastctl.control.entry import Command
 from mastctl.http import PREFIX
 from mastctl.motion.requests import Angle, Name, Place, StrictBody
 from mastctl.panorama.folder import Index
@@ -70,7 +70,7 @@ def add_panoramas(app: FastAPI) -> None:
     @command(
         app,
         "POST /panoramas",
-        PANORAMA,
+        Command("panorama", steers=True, need="motion"),
         status_code=202,
         usual_s=lambda here, body: 400 * WAY_S + usual_s(here.service.config.limits, 0),
     )
@@ -90,7 +90,7 @@ def add_panoramas(app: FastAPI) -> None:
     async def about(name: Panorama, here: Here) -> Index:
         return await here.waiting.run(lambda: here.service.panoramas.open(name).index)
 
-    @command(app, "DELETE /panoramas/{name}", PANORAMA_DELETE)
+    @command(app, "DELETE /panoramas/{name}", Command("panorama.delete", "admin"))
     def delete(name: Panorama, here: Here) -> PanoramaList:
         """Delete a panorama with its pictures."""
         return here.service.panoramas.delete(name)
@@ -130,12 +130,12 @@ def add_targets(app: FastAPI) -> None:
     async def targets(here: Here) -> TargetList:
         return {"targets": await here.waiting.run(here.service.targets.all)}
 
-    @command(app, "POST /targets/{name}", TARGET_KEEP)
+    @command(app, "POST /targets/{name}", Command("target.keep"))
     def keep(name: PlaceName, body: TargetBody, here: Here) -> TargetList:
         """Keep a target by a name."""
         return {"targets": here.service.targets.keep_measured(name, body)}
 
-    @command(app, "DELETE /targets/{name}", TARGET_FORGET)
+    @command(app, "DELETE /targets/{name}", Command("target.forget"))
     def forget(name: PlaceName, here: Here) -> TargetList:
         """Forget a target."""
         return {"targets": here.service.targets.forget(name)}

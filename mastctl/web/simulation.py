@@ -16,7 +16,7 @@ from drivers.faults import BOUNDS, WHEN, FaultPanel, Word
 from drivers.simulation_clock import MAX, SimulationClock
 from mastctl import answers
 from mastctl.as_json import as_json
-from mastctl.control import entry
+from mastctl.control.entry import Command
 from mastctl.errors import BadRequest, NoLonger, NotKnown, NotNow
 from mastctl.http import PREFIX
 from mastctl.motion.requests import LARGEST_M, LARGEST_PX, Angle, Metres, Name, Place, StrictBody
@@ -115,7 +115,7 @@ def add_simulation(app: FastAPI) -> None:
     async def true_pose(here: Here) -> answers.TruePose:
         return await here.waiting.run(lambda: _pose(_rover(here.service, "true poses").site_from_rover))
 
-    @command(app, "POST /simulation/pose", entry.SIMULATION_POSE)
+    @command(app, "POST /simulation/pose", Command("simulation.pose"))
     def stand(body: StandBody, here: Here) -> answers.TruePose:
         """Put the simulated rover somewhere on its ground."""
         rover = _rover(here.service, "true poses")
@@ -126,7 +126,7 @@ def add_simulation(app: FastAPI) -> None:
     async def boards(here: Here) -> answers.BoardList:
         return await here.waiting.run(lambda: _boards(_rover(here.service, "boards")))
 
-    @command(app, "POST /simulation/boards/{name}", entry.SIMULATION_BOARD)
+    @command(app, "POST /simulation/boards/{name}", Command("simulation.board"))
     def put_board(name: BoardName, body: BoardBody, here: Here) -> answers.BoardPose:
         """Hold up a board, or move it."""
         rover = _rover(here.service, "boards")
@@ -146,7 +146,7 @@ def add_simulation(app: FastAPI) -> None:
         )
         return _board(rover, stands)
 
-    @command(app, "DELETE /simulation/boards/{name}", entry.SIMULATION_BOARD_GONE)
+    @command(app, "DELETE /simulation/boards/{name}", Command("simulation.board_gone"))
     def take_board(name: BoardName, here: Here) -> answers.BoardList:
         """Take a board away from the simulated rover."""
         rover = _rover(here.service, "boards")
@@ -157,7 +157,7 @@ def add_simulation(app: FastAPI) -> None:
     async def time(here: Here) -> answers.SimulationTime:
         return await here.waiting.run(lambda: _time(here.service))
 
-    @command(app, "POST /simulation/time", entry.SIMULATION_TIME)
+    @command(app, "POST /simulation/time", Command("simulation.time"))
     def advance(body: TimeBody, here: Here) -> answers.SimulationTime:
         """Let time pass where it does not pass by itself."""
         speed = _time(here.service)["speed"]
@@ -183,14 +183,14 @@ def add_simulation(app: FastAPI) -> None:
     async def faults(here: Here) -> answers.FaultsSet:
         return await here.waiting.run(lambda: _faults(_panel(here.service)))
 
-    @command(app, "POST /simulation/faults", entry.SIMULATION_FAULT)
+    @command(app, "POST /simulation/faults", Command("simulation.fault"))
     def set_fault(body: FaultBody, here: Here) -> answers.FaultsSet:
         """Switch a fault on."""
         panel = _panel(here.service)
         panel.set(body.device, body.word, **body.parameters)
         return _faults(panel)
 
-    @command(app, "DELETE /simulation/faults", entry.SIMULATION_FAULTS_OFF)
+    @command(app, "DELETE /simulation/faults", Command("simulation.faults_off"))
     def clear_faults(query: Annotated[FaultsQuery, Query()], here: Here) -> answers.FaultsSet:
         """Switch the faults of one device, or all, off."""
         panel = _panel(here.service)

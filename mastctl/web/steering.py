@@ -15,8 +15,7 @@ from pydantic import BaseModel, Field, StringConstraints, model_validator
 
 from calib.geometry.rigid import Rigid, rotation_of
 from mastctl import answers
-from mastctl.control import entry
-from mastctl.control.entry import CommandRequest
+from mastctl.control.entry import ESTOP, STOP, Command, CommandRequest
 from mastctl.control.lease import LONGEST_S, SHORTEST_S, USUAL_S, Lease, LeaseTable, client_name
 from mastctl.devices.judge import LEAST_CONE_RAD, WIDEST_CONE_RAD, SunDirection, direction_of
 from mastctl.errors import BadRequest, NotNow, Unable, one_line
@@ -173,7 +172,7 @@ def add_pointing(app: FastAPI) -> None:
     @command(
         app,
         "POST /point",
-        entry.POINT,
+        Command("point", steers=True, need="motion"),
         status_code=202,
         usual_s=lambda here, body: usual_s(here.service.config.limits, body.captures),
     )
@@ -213,7 +212,7 @@ def add_pointing(app: FastAPI) -> None:
     async def operation(operation_id: str, here: Here) -> answers.OperationAnswer:
         return here.service.operations.get(operation_id).as_json()
 
-    @command(app, "POST /operations/{operation_id}/stop", entry.OPERATION_STOP, beside=True)
+    @command(app, "POST /operations/{operation_id}/stop", Command("operation.stop"), beside=True)
     def stop_one(operation_id: str, here: Here) -> answers.OperationAnswer:
         """Stop the mast and one operation, if it still runs; what another client began goes on."""
         here.service.operations.stop_one(operation_id)
@@ -221,7 +220,7 @@ def add_pointing(app: FastAPI) -> None:
 
     @app.post(f"{PREFIX}/stop", summary="Stop the mast and the running operation, at once")
     async def stop(request: Request, here: Here) -> answers.StopAnswer:
-        return await stop_first(here, entry.STOP, request, here.service.stopping.stop_answer)
+        return await stop_first(here, STOP, request, here.service.stopping.stop_answer)
 
 
 def add_estop(app: FastAPI) -> None:
@@ -237,12 +236,12 @@ def add_estop(app: FastAPI) -> None:
         stopping = here.service.stopping
         given = await _reason_and_name(request)
         try:
-            return await stop_first(here, entry.ESTOP, request, partial(stopping.estop, **given), given)
+            return await stop_first(here, ESTOP, request, partial(stopping.estop, **given), given)
         except StopsHang as error:
             await here.waiting.run(lambda: stopping.latch_estop(**given))
             raise Unable("stop_unconfirmed", f"the emergency stop is latched, but {error}") from None
 
-    @command(app, "POST /reset", entry.RESET)
+    @command(app, "POST /reset", Command("reset", need="latch"))
     def reset(body: ResetBody, here: Here) -> answers.ResetAnswer:
         """Release an emergency stop; nothing moves before the next command."""
         return here.service.stopping.reset(body.reason, body.name)
@@ -273,7 +272,7 @@ def add_tracking(app: FastAPI) -> None:
     def one_look_s(here: Parts, **_: Any) -> float:
         return usual_s(here.service.config.limits, 1)
 
-    @command(app, "POST /pose", entry.POSE, usual_s=one_look_s)
+    @command(app, "POST /pose", Command("pose"), usual_s=one_look_s)
     def pose(body: PoseBody, here: Here, requested: Requested) -> answers.PoseTaken:
         """Say where the rover stands; a track is carried over and looked for."""
         operation = here.service.steering.take_pose(body.pose(requested.came_s), body.look)
@@ -284,17 +283,25 @@ def add_tracking(app: FastAPI) -> None:
     async def track(here: Here) -> answers.TrackAnswer:
         return here.service.track_answer()
 
-    @command(app, "POST /track", entry.TRACK, status_code=202, usual_s=one_look_s)
+    @command(
+        app, "POST /track", Command("track", steers=True, need="track"), status_code=202, usual_s=one_look_s
+    )
     def start(body: TrackRequest, here: Here) -> answers.Started:
         """Follow what a pixel shows, or is at a position."""
         return {"id": here.service.steering.start_track(body).id}
 
-    @command(app, "POST /track/look", entry.TRACK_LOOK, status_code=202, usual_s=one_look_s)
+    @command(
+        app,
+        "POST /track/look",
+        Command("track.look", steers=True, need="motion"),
+        status_code=202,
+        usual_s=one_look_s,
+    )
     def look(here: Here) -> answers.Started:
         """Look for the target once more."""
         return {"id": here.service.steering.look().id}
 
-    @command(app, "POST /track/stop", entry.TRACK_STOP, beside=True)
+    @command(app, "POST /track/stop", Command("track.stop", steers=True), beside=True)
     def stop(here: Here) -> answers.TrackAnswer:
         """End the track; the head stops if it moves for it."""
         here.service.stopping.stop_track()
@@ -304,7 +311,7 @@ def add_tracking(app: FastAPI) -> None:
 def add_limits(app: FastAPI) -> None:
     """The jog, and the sun."""
 
-    @command(app, "POST /jog", entry.JOG)
+    @command(app, "POST /jog", Command("jog", steers=True, goes_on=True))
     def jog(body: JogBeat, here: Here) -> answers.JogAnswer:
         """A heartbeat: turn the head at a rate, for half a second."""
         return here.service.jogs.beat(body)
@@ -313,7 +320,7 @@ def add_limits(app: FastAPI) -> None:
     async def sun(here: Here) -> answers.SunAnswer:
         return here.service.devices.judge.sun_as_json()
 
-    @command(app, "POST /limits/sun", entry.SUN)
+    @command(app, "POST /limits/sun", Command("limits.sun"))
     def tell(body: SunBody, here: Here, requested: Requested) -> answers.SunAnswer:
         """Say where the sun stands; the head keeps off it."""
         judge = here.service.devices.judge
@@ -321,7 +328,7 @@ def add_limits(app: FastAPI) -> None:
         stop_before_keep_outs(here.service)
         return judge.sun_as_json()
 
-    @command(app, "DELETE /limits/sun", entry.SUN_FORGET)
+    @command(app, "DELETE /limits/sun", Command("limits.sun.forget"))
     def forget(here: Here) -> answers.SunAnswer:
         """Keep the head off no sun any more."""
         judge = here.service.devices.judge
@@ -343,26 +350,26 @@ def add_lease(app: FastAPI) -> None:
     async def control(here: Here) -> answers.LeaseAnswer:
         return {"control": here.service.leases.control()}
 
-    @command(app, "POST /lease", entry.LEASE)
+    @command(app, "POST /lease", Command("lease", grants=True))
     def acquire(body: LeaseBody, here: Here, requested: Requested) -> answers.LeaseGranted:
         """Acquire the lease, if no other client steers."""
         leases = here.service.leases
         return _granted(leases, leases.acquire(requested.caller, **_terms(body, requested)))
 
-    @command(app, "POST /lease/renew", entry.LEASE_RENEW)
+    @command(app, "POST /lease/renew", Command("lease.renew", grants=True))
     def renew(here: Here, requested: Requested, body: RenewBody | None = None) -> answers.LeaseGranted:
         """Have the lease run for its time from now on."""
         leases = here.service.leases
         return _granted(leases, leases.renew(_lease_of(requested), None if body is None else body.for_s))
 
-    @command(app, "DELETE /lease", entry.LEASE_RELEASE)
+    @command(app, "DELETE /lease", Command("lease.release"))
     def release(here: Here, requested: Requested) -> answers.LeaseAnswer:
         """Release the lease."""
         leases = here.service.leases
         leases.release(_lease_of(requested))
         return {"control": leases.control()}
 
-    @command(app, "POST /lease/take", entry.LEASE_TAKE)
+    @command(app, "POST /lease/take", Command("lease.take", grants=True))
     def take(body: TakeBody, here: Here, requested: Requested) -> answers.LeaseGranted:
         """Take the lease from its holder; what runs under it is stopped."""
         leases = here.service.leases

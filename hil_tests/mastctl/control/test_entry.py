@@ -14,9 +14,6 @@ from drivers.errors import NoReply
 from hil_tests.mastctl.service_fakes import on_disk
 from mastctl.control.entry import (
     ESTOP,
-    JOG,
-    POINT,
-    POSE,
     STOP,
     Answers,
     AuditLog,
@@ -30,6 +27,9 @@ from mastctl.control.publisher import Publisher
 from mastctl.drift.journal import JournalThread
 from mastctl.errors import MastctlError, NotNow
 
+POINT = Command("point", steers=True, need="motion")
+JOG = Command("jog", steers=True, goes_on=True)
+POSE = Command("pose")
 BENCH = Caller("bench")
 ROVER = Caller("rover")
 
