@@ -194,9 +194,7 @@ class DeviceThread:
         self.end()
         self._thread.join(timeout_s)
         if self._thread.is_alive():
-            # A simulated clock stands while another thread computes, a picture for example: nothing hangs.
-            why = "the driver hangs" if self._overdue() else "its last call is still under way"
-            log.warning("%s: %s; its thread is left behind", self._device, why)
+            log.warning("%s: a call is still under way; its thread is left behind", self._device)
 
     def typed(self, name: str, error: BaseException) -> Exception:
         """Return what a driver raised as an error of the service's own kind, with the device's name."""
@@ -342,7 +340,7 @@ class HeadThread(DeviceThread):
         self._queued_s: float | None = None  # when the stop was requested that waits in the head's thread
         self._inside: list[_Inside] = []
         self._good_s = float("-inf")  # when a stop came back last that went well
-        self._failed: tuple[_Inside, Exception] | None = None
+        self._failed = float("-inf"), Exception()  # when the last stop went in that failed, and how
         self._stop_fault: StandingFault | None = None
         self._overdue_s = float("inf")
         super().__init__(device, faults=faults, moves="move", clock=clock)
@@ -407,10 +405,10 @@ class HeadThread(DeviceThread):
     def faults(self) -> tuple[StandingFault, ...]:
         """Return what is wrong with calls and stops at this moment; takes no lock."""
         now_s = self._clock.now_s()
-        fault, queued_s = self._stop_fault, self._queued_s
+        fault = self._stop_fault
         overdue = self._overdue_stop(now_s)
         if overdue:
-            since_s = min([one.requested_s for one in tuple(self._inside)] + [queued_s or now_s])
+            since_s = min((one.requested_s for one in tuple(self._inside)), default=now_s)
             message, until = f"{self._device}: {overdue}; {MAY_MOVE}", f"it is back, and then {UNTIL}"
             fault = StandingFault(self._device, NoReply.code, message, since_s, until)
         return super().faults() + (() if fault is None else (fault,))
@@ -426,9 +424,9 @@ class HeadThread(DeviceThread):
                 self._queued_s = requested_s
             while self._good_s < requested_s:
                 now_s = self._clock.now_s()
-                failed = self._failed is not None and self._failed[0].began_s >= requested_s
-                if failed and self._failed is not None and (self._queued_s is None or now_s >= deadline_s):
-                    raise self._failed[1]
+                failed_s, error = self._failed
+                if failed_s >= requested_s and (self._queued_s is None or now_s >= deadline_s):
+                    raise error
                 if now_s >= deadline_s:
                     message = f"stop did not end within its deadline{alone}; {MAY_MOVE}"
                     raise NoReply(message, device=self._device)
@@ -478,17 +476,18 @@ class HeadThread(DeviceThread):
         except BaseException as anything:  # a driver from outside may raise what it likes
             error = self.typed("stop", anything)
         ended_s = self._clock.now_s()
-        message = f"{self._device}: a stop requested {ended_s - inside.requested_s:.1f} s ago "
-        message += "ended only now" if error is None else f"failed only now: {error}"
         with self._stops_changed:
             self._inside.remove(inside)
             if error is None:
                 self._good_s = ended_s
             else:
-                self._failed = inside, error
+                self._failed = inside.began_s, error
             self._stops_changed.notify_all()
         if ended_s > inside.requested_s + self._overdue_s:
-            log.warning("%s", message)
+            ended = "ended only now" if error is None else f"failed only now: {error}"
+            log.warning(
+                "%s: a stop requested %.1f s ago %s", self._device, ended_s - inside.requested_s, ended
+            )
         if error is not None:
             raise error
 

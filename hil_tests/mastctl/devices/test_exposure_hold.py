@@ -111,6 +111,3 @@ def test_a_camera_that_cannot_hold_is_told_and_the_others_hold(
         pass
     clock.until(lambda: left.told == ["picture", "held", "released"], "a hold that goes well")
     assert devices.faults() == ()
-
-
-# What else a camera is asked outside a picture

@@ -42,12 +42,6 @@ def test_what_is_not_finite_is_refused(axis: str, value: float) -> None:
         LIMITS.check(*angles)
 
 
-def test_speed_is_capped_and_defaults_to_the_cap() -> None:
-    assert LIMITS.speed(None) == 1.0
-    assert LIMITS.speed(0.25) == 0.25
-    assert LIMITS.speed(7.0) == 1.0
-
-
 @pytest.mark.parametrize("speed", [0.0, -0.1, math.nan, math.inf])
 def test_a_speed_that_a_servo_could_take_for_full_speed_is_refused(speed: float) -> None:
     with pytest.raises(OutsideLimits, match="finite number above 0"):

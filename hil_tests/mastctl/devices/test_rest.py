@@ -10,11 +10,7 @@ import pytest
 
 from calib.geometry.rig import JointErrors
 from drivers.interfaces import Reading
-from hil_tests.mastctl.devices.turned import Turned
-from hil_tests.mastctl.service_fakes import FakeHardware, rig
-from mastctl.devices.devices import Devices
 from mastctl.devices.joint_history import DITHER_RAD, JointHistory, RestWatch
-from mastctl.devices.judge import Limits
 
 XM430_RAD = 2 * math.pi / 4096
 """A count of a 12-bit servo."""
@@ -110,9 +106,6 @@ def test_a_head_that_always_says_that_it_moves_does_not_rest() -> None:
     assert first_rest_s(dither(XM430_RAD, 2, 5), lambda time_s: time_s > 0.01) is None
 
 
-# In a pointing
-
-
 # In frames and in the status
 
 
@@ -164,21 +157,3 @@ def test_a_dither_is_no_rest_within_a_second_of_a_move() -> None:
     assert at_the_end(made)
     made.add(Reading(0.0, 0.0, True, 13.0))
     assert made.newest is not None and made.newest.moving
-
-
-def test_the_service_takes_a_head_that_dithers_for_one_at_rest(clock: Turned) -> None:
-    hardware, count = FakeHardware(clock=clock), [0]
-
-    def answer(head: object) -> Reading:
-        count[0] += 1
-        return Reading(shaking(count[0]), 0.0, count[0] % 2 == 0, clock.now_s())
-
-    hardware.head.answer = answer
-    shaken = Devices(
-        hardware.pan_tilt, hardware.cameras, Limits((-2.0, 2.0), (-1.0, 1.0), 0.5), "0" * 64, clock, rig()
-    )
-    with clock.at_work():
-        clock.sleep(1.5)
-        assert not any(shaken.read().moving for _ in range(20))
-        assert not shaken.frames(["navcam_left"], clock.now_s(), 2.0)["navcam_left"].moving
-    shaken.close()

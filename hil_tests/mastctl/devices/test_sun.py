@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Mast, Rig, RigCamera
-from mastctl.devices.judge import ROWS, SunDirection, direction_of, sun_boxes
+from mastctl.devices.judge import ROWS, direction_of, sun_boxes
 from mastctl.devices.keep_out import TOUCH_RAD
 
 TILTS = (-1.2, 1.2)
@@ -86,9 +86,3 @@ def test_azimuth_goes_from_forward_to_the_right_and_elevation_up() -> None:
     assert direction_of(0.0, 0.0) == pytest.approx((1.0, 0.0, 0.0))
     assert direction_of(math.pi / 2, 0.0) == pytest.approx((0.0, 1.0, 0.0))
     assert direction_of(0.3, math.pi / 2) == pytest.approx((0.0, 0.0, -1.0), abs=1e-12)
-
-
-def test_a_direction_holds_until_its_moment() -> None:
-    sun = SunDirection((1.0, 0.0, 0.0), "rover", 0.1, 10.0)
-    assert sun.holds(10.0) and not sun.holds(10.001)
-    assert replace(sun, until_s=None).holds(1e12)
