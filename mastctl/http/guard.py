@@ -13,9 +13,8 @@ from __future__ import annotations
 import ipaddress
 import json
 import logging
-from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import urlsplit
 
 from starlette.exceptions import HTTPException
@@ -23,11 +22,13 @@ from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from mastctl.config import is_loopback
+from mastctl.control.entry import CommandEntry
 from mastctl.control.lease import NETWORK, Caller, client_name
 from mastctl.errors import MastctlError, NotAllowed, NotLetIn, one_line
 from mastctl.http import PREFIX
 from mastctl.http.refusals import NO_PAGE, PAGE, SITE, marked, refusal_response
 from mastctl.http.tokens import Access
+from mastctl.http.waiting import Waiting
 
 log = logging.getLogger(__name__)
 
@@ -142,10 +143,9 @@ def address_of(line: HTTPConnection) -> str:
 
 def from_this_machine(line: HTTPConnection) -> bool:
     """Return whether a request came from this machine and by no proxy that states otherwise."""
-    client, server = line.client, line.scope.get("server")
-    if forwarded(line):
-        return False
-    return not client or is_loopback(client.host) or bool(server and client.host == server[0])
+    client = line.client.host if line.client else "localhost"
+    here, _ = line.scope.get("server") or ("", None)
+    return not forwarded(line) and (is_loopback(client) or client == here)
 
 
 def forwarded(line: HTTPConnection) -> str:
@@ -184,25 +184,22 @@ def _is_address(name: str) -> bool:
     return True
 
 
-class Records(Protocol):
-    """The part of `mastctl.control.entry.CommandEntry` that keeps refusals."""
-
-    def refused(self, caller: Caller, command: str, code: str, message: str) -> None: ...
-
-
 class Guard:
     """ASGI middleware around the API, for requests and for WebSockets.
 
-    ``records`` gets the refusals of requests that are no commands yet; ``turn`` is awaited before each
-    request that is no stop.
+    ``records`` gets the refusals of requests that are no commands yet; what is no stop waits for its turn.
     """
 
     def __init__(
-        self, app: ASGIApp, entrance: EntryRules, turn: Callable[[], Awaitable[None]], records: Records | None
+        self,
+        app: ASGIApp,
+        entrance: EntryRules,
+        waiting: Waiting,
+        records: CommandEntry | None,
     ) -> None:
         self._app = app
         self._entrance = entrance
-        self._turn = turn
+        self._waiting = waiting
         self._records = records
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -227,7 +224,7 @@ class Guard:
                 check_page(line)
                 _set_caller(line, self._entrance.any_caller(line))
             else:
-                await self._turn()
+                await self._waiting.turn()
                 self._let_in(line)
             await self._app(scope, bounded(receive), send_marked)
         except Exception as error:

@@ -23,7 +23,6 @@ from typing_extensions import get_type_hints, is_typeddict
 
 from mastctl import answers
 from mastctl.answers import EVENT_VALUES, WELL, Count, ErrorBody
-from mastctl.control.lease import Caller
 from mastctl.errors import Unable
 from mastctl.http import PREFIX
 from mastctl.http.guard import Guard, cookie_name, from_this_machine, shown_token
@@ -49,7 +48,7 @@ def create_app(parts: Parts) -> ASGIApp:
         scope.setdefault("state", {})["parts"] = parts
         await routes(scope, receive, send)
 
-    return Guard(served, parts.entrance, parts.waiting.turn, parts.service.entry)
+    return Guard(served, parts.entrance, parts.waiting, parts.service.entry)
 
 
 class _Route(APIRoute):
@@ -163,8 +162,7 @@ def add_sessions(app: FastAPI) -> None:
 
 
 def _session(request: Request, here: Here) -> answers.ClientSession:
-    caller: Caller = request.scope["state"]["caller"]
-    needs_token = here.entrance.access is not None
+    caller, needs_token = caller_of(request), here.entrance.access is not None
     return {"name": caller.name, "role": caller.role, "via": caller.via, "needs_token": needs_token}
 
 

@@ -18,7 +18,7 @@ from fastapi.requests import HTTPConnection
 from pydantic import BaseModel, ConfigDict
 
 from mastctl.control.entry import Answer, Command, CommandRequest
-from mastctl.control.lease import Caller, client_name
+from mastctl.control.lease import Caller
 from mastctl.errors import Unable
 from mastctl.http import PREFIX
 from mastctl.http.guard import EntryRules
@@ -181,12 +181,9 @@ async def stopped(service: Service, stop: Callable[[], T]) -> T:
         raise Unable("stop_pending", message) from None
 
 
-def caller_of(request: Request) -> Caller:
-    """Return the caller that the guard found; else one by its name alone."""
-    caller = request.scope.get("state", {}).get("caller")
-    return (
-        caller if isinstance(caller, Caller) else Caller(client_name(request.headers.get("mastctl-client")))
-    )
+def caller_of(line: HTTPConnection) -> Caller:
+    """Return the caller that the guard found."""
+    return cast(Caller, line.scope["state"]["caller"])
 
 
 def _request_of(given: Mapping[str, Any]) -> dict[str, Any]:

@@ -21,12 +21,11 @@ from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocketDisconnect
 
 from mastctl.as_json import writable
-from mastctl.control.lease import Caller
 from mastctl.control.publisher import TOPICS, LoopSubscription, Published, Topic
 from mastctl.http import PREFIX
 from mastctl.motion.requests import Name
 from mastctl.service.service import Service
-from mastctl.web.commands import Here, Parts, StrictQuery, stream_of
+from mastctl.web.commands import Here, Parts, StrictQuery, caller_of, stream_of
 
 EVENTS = f"{PREFIX}/events"
 MOST_KEYS = 16
@@ -76,7 +75,7 @@ def add_events(app: FastAPI) -> None:
 
     @app.websocket(EVENTS)
     async def socket(line: WebSocket, query: Annotated[EventsQuery, Query()], here: Here) -> None:
-        with here.streams.listening(query.names, query.keys, credential_of(line)) as news:
+        with here.streams.listening(query.names, query.keys, caller_of(line).credential) as news:
             await _send(line, news, here)
 
 
@@ -101,7 +100,7 @@ class _Lines(StreamingResponse):
         self._here, self._query = here, query
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        query, credential = self._query, credential_of(HTTPConnection(scope))
+        query, credential = self._query, caller_of(HTTPConnection(scope)).credential
         with self._here.streams.listening(query.names, query.keys, credential) as self._news:
             await super().__call__(scope, receive, send)
 
@@ -151,9 +150,3 @@ async def close_ended(line: WebSocket, here: Parts) -> None:
         await line.close(GOING_AWAY)
     else:
         await line.close(NOT_ALLOWED, "the token that opened this has ended")
-
-
-def credential_of(line: HTTPConnection) -> str:
-    """Return the digest of the token that opened a stream, empty for none."""
-    caller: Caller = line.scope["state"]["caller"]
-    return caller.credential

@@ -27,8 +27,8 @@ from mastctl.frame_facts import described_headers, headers_of
 from mastctl.http import PREFIX
 from mastctl.motion.requests import Name, StrictBody
 from mastctl.report.pictures import encoded
-from mastctl.web.commands import Here, Parts, StrictQuery, command, file_of
-from mastctl.web.events import MOST_KEYS, UNSUPPORTED, close_ended, credential_of
+from mastctl.web.commands import Here, Parts, StrictQuery, caller_of, command, file_of
+from mastctl.web.events import MOST_KEYS, UNSUPPORTED, close_ended
 from mastctl.web.pictures import Picture, Viewer
 
 IMAGES = f"{PREFIX}/images"
@@ -103,7 +103,7 @@ def add_images(app: FastAPI) -> None:
     async def socket(line: WebSocket, query: Annotated[ImagesQuery, Query()], here: Here) -> None:
         for camera in query.camera:
             here.service.check_camera(camera)
-        with here.streams.listening((), frozenset(), credential_of(line)) as ending:
+        with here.streams.listening((), frozenset(), caller_of(line).credential) as ending:
             await line.accept()
             with here.feeds.viewer(query.camera, not query.on_request, query.every) as viewer:
                 await _Line(here, line, viewer).run(asyncio.ensure_future(ending.wait()))

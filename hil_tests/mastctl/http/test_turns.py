@@ -21,7 +21,7 @@ def test_a_stop_passes_what_came_before_it(stop: str) -> None:
         begun.append(scope["path"])
 
     async def crowd() -> None:
-        guard = Guard(inside, EntryRules(), Waiting().turn, None)
+        guard = Guard(inside, EntryRules(), Waiting(), None)
         requests = [("GET", "/api/v1/health/live")] * CROWD + [("POST", stop)]
         async with asyncio.TaskGroup() as group:
             for method, path in requests:

@@ -96,30 +96,6 @@ def test_a_pointing_is_accepted_and_records_steps_and_residual(
     assert ("move", 0.1, -0.1, 0.5) in hardware.head.calls
 
 
-def test_the_request_reaches_the_loop_as_it_was_made(
-    web: httpx.Client, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    requests: list[Any] = []
-    monkeypatch.setattr(
-        ScriptedLoop, "script", staticmethod(lambda request, *others: requests.append(request))
-    )
-    frame_id = web.get("/snapshot/navcam_left").headers["Mastctl-Frame-Id"]
-    pixel = {"camera": "navcam_left", "frame_id": frame_id, "x_px": 12.5, "y_px": 7}
-    aim = {"camera": "navcam_right", "x_px": 1.0, "y_px": 2.0}
-    for body in (
-        {"pixel": pixel, "aim": aim, "pointings": 2},
-        {"position_m": [1, 2, 3], "frame": "site"},
-        dict(ANGLES),
-    ):
-        ended(web, web.post("/point", json=body).json()["id"])
-    clicked, placed, turned = requests
-    assert (clicked.pixel.camera, clicked.pixel.frame_id) == ("navcam_left", frame_id)
-    assert (clicked.pixel.x_px, clicked.pixel.y_px, clicked.pointings) == (12.5, 7.0, 2)
-    assert (clicked.aim.camera, clicked.aim.x_px, clicked.aim.y_px) == ("navcam_right", 1.0, 2.0)
-    assert (placed.position_m, placed.frame) == ([1.0, 2.0, 3.0], "site")
-    assert (turned.angles_rad, turned.aim) == ((0.1, -0.1), None)
-
-
 P = {"camera": "navcam_left", "frame_id": "f", "x_px": 1.0, "y_px": 2.0}
 BAD_POINTS: list[tuple[Any, str]] = [
     ({}, "0 targets where exactly one of pixel, panorama, position_m, pan_rad with tilt_rad is expected"),

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import httpx
 import pytest
 
 from hil_tests.mastctl.service_fakes import FakeHardware
 from hil_tests.waiting import NET_S, until
-from mastctl.client import Client, ClientError
-from mastctl.client.steering import Jog
 from mastctl.daemon import RunningDaemon
 from mastctl.motion import jog as jog_module
 from mastctl.safety.stop_socket import request
@@ -27,15 +23,6 @@ def endless(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def moves(hardware: FakeHardware) -> int:
     return sum(1 for call in hardware.head.calls if call[0] == "move")
-
-
-def is_refused(jog: Jog) -> bool:
-    """Whether a heartbeat was refused."""
-    try:
-        jog.check()
-    except ClientError:
-        return True
-    return False
 
 
 def beat(web: httpx.Client, number: int) -> str:
@@ -58,16 +45,3 @@ def test_a_stop_by_its_socket_ends_a_jog_though_nameless_heartbeats_go_on(
     for number in range(2, 6):
         assert beat(web, number) in ("jog_ended", "stopping")
     assert moves(pair[1]) == before, "a heartbeat of the jog that was stopped moved the head"
-
-
-@pytest.mark.usefixtures("endless")
-def test_the_page_and_the_client_begin_anew_at_once(pair: Pair, web: httpx.Client) -> None:
-    with Client(pair[0].url) as client:
-        for _ in range(3):
-            with pytest.raises(ClientError) as ended, client.jog() as jog:
-                before = moves(pair[1])
-                jog.rates(0.1, 0.0)
-                until(lambda: moves(pair[1]) > before, "the head turns")  # noqa: B023
-                client.stop()
-                until(partial(is_refused, jog), "the next heartbeat is refused")
-            assert ended.value.code == "jog_ended"

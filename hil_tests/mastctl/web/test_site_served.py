@@ -23,7 +23,7 @@ def client_of(monkeypatch: pytest.MonkeyPatch, folder: Path) -> TestClient:
     app = FastAPI(docs_url=None)
     add_errors(app)
     page.add_site(app)
-    guard = Guard(app, EntryRules(), Waiting().turn, None)
+    guard = Guard(app, EntryRules(), Waiting(), None)
     return TestClient(guard, base_url="http://127.0.0.1", follow_redirects=False)
 
 
