@@ -6,7 +6,10 @@ import contextlib
 import json
 import random
 import socket
+import subprocess
+import sys
 import threading
+import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +27,7 @@ from mastctl.client import Client, ClientError
 from mastctl.control.machine import Latched
 from mastctl.errors import NotNow, Stopped, Unable
 from mastctl.safety import latch as latch_module
-from mastctl.safety.latch import FILE, Estopped, Latch
+from mastctl.safety.latch import FILE, Estopped, Latch, latched_at
 from mastctl.safety.state_folder import StateFile, StateFolder, usual_folder
 from mastctl.service import stopping as stopping_module
 
@@ -383,3 +386,41 @@ def test_a_second_daemon_of_one_state_folder_does_not_touch_the_head(tmp_path: P
         assert second.returncode == 1
         assert "is in use by another daemon" in words.splitlines()[-1]
         assert "Traceback" not in words
+
+
+LATCHES_AND_RELEASES = """
+import sys
+from pathlib import Path
+from mastctl.safety.latch import Latch
+from mastctl.safety.state_folder import StateFolder
+
+latch = Latch(StateFolder(Path(sys.argv[1])))
+while True:
+    latch.add("smoke", "Ana")
+    assert latch.keep(60.0)
+    print("kept", flush=True)
+    sys.stdin.readline()
+    latch.release("aired", "Ben")
+    print("released", flush=True)
+    sys.stdin.readline()
+"""
+
+
+@pytest.mark.long(1, "100 programs are started and killed")
+def test_a_kill_at_any_moment_leaves_what_was_confirmed_last(tmp_path: Path) -> None:
+    chance = random.Random(1)
+    command = [sys.executable, "-c", LATCHES_AND_RELEASES, str(tmp_path)]
+    for number in range(100):
+        with subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        ) as program:
+            assert program.stdin is not None and program.stdout is not None
+            assert program.stdout.readline() == "kept\n"
+            if released := bool(number % 3):
+                program.stdin.write("\n")
+                program.stdin.flush()
+                time.sleep(chance.uniform(0.0, 0.004))
+            program.kill()
+            confirmed = "released" in program.stdout.read()
+        if confirmed or not released:
+            assert bool(latched_at([tmp_path])) is not confirmed, f"kill {number}"
