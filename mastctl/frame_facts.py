@@ -1,9 +1,8 @@
-"""The facts of a picture: the one list of what stands beside it, in the daemon, in headers, in the client."""
+"""The facts of an image: their one list, for the daemon, for headers and for the client."""
 
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar
@@ -11,7 +10,7 @@ from typing import Any, ClassVar
 
 @dataclass(frozen=True, eq=False)
 class FrameFacts:
-    """What a picture is worth little without; ``sequence`` is the camera's own count.
+    """What an image is worth little without; ``sequence`` is the camera's own count.
 
     ``mid_exposure_s`` is of CLOCK_MONOTONIC. The joint angles are those at mid-exposure, interpolated from
     the measured ones around it: as read, and true by the ``joints`` of the mast file, whose SHA-256 (hex) is
@@ -65,26 +64,11 @@ def described_headers() -> dict[str, Any]:
     }
 
 
-def _settings_in(text: str) -> dict[str, float | None]:
-    """What a picture was taken with, from JSON. Raises ValueError."""
-    stated = json.loads(text)
-    if not isinstance(stated, dict) or not all(one is None or _is_number(one) for one in stated.values()):
-        raise ValueError("an object of numbers is expected")
-    return {name: None if value is None else float(value) for name, value in stated.items()}
-
-
-def _is_number(value: object) -> bool:
-    """Whether it is a number within the range of floats; `drivers.options` has the same and loads NumPy."""
-    if not isinstance(value, int | float) or isinstance(value, bool):
-        return False
-    return abs(value) <= sys.float_info.max
-
-
 _HEADERS = {one.name: "Mastctl-" + one.name.replace("_", "-").title() for one in fields(FrameFacts)}
 _READ: Mapping[str, Callable[[str], Any]] = {
     "str": str,
     "int": int,
     "float": float,
     "bool": {"true": True, "false": False}.__getitem__,
-    "Mapping[str, float | None]": _settings_in,
+    "Mapping[str, float | None]": json.loads,
 }

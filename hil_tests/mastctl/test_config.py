@@ -68,9 +68,7 @@ def test_a_good_configuration_is_read_whole() -> None:
         ({"socket": "/run/mast.sock", "hosts": ["rover.local"]}, True),
     ],
 )
-def test_a_token_is_asked_for_where_others_than_this_machine_may_come_in(
-    listen: dict[str, Any], needs: bool
-) -> None:
+def test_a_token_is_required_where_other_machines_may_reach_it(listen: dict[str, Any], needs: bool) -> None:
     assert parsed(changed("listen", listen)).listen.needs_token is needs
 
 
@@ -142,14 +140,14 @@ BAD: list[tuple[str, Any, str, str]] = [
 
 
 @pytest.mark.parametrize(
-    ("place", "value", "told_place", "words"), BAD, ids=[f"{b[0]}={b[1]}"[:40] for b in BAD]
+    ("place", "value", "named_place", "sentence"), BAD, ids=[f"{b[0]}={b[1]}"[:40] for b in BAD]
 )
-def test_what_is_wrong_is_named(place: str, value: Any, told_place: str, words: str) -> None:
+def test_what_is_wrong_is_named(place: str, value: Any, named_place: str, sentence: str) -> None:
     with pytest.raises(BadFile) as refused:
         parsed(changed(place, value))
     text = str(refused.value)
-    assert text.startswith(f"rover/daemon.yaml: {told_place}: ")
-    assert words in text
+    assert text.startswith(f"rover/daemon.yaml: {named_place}: ")
+    assert sentence in text
     assert "\n" not in text
 
 
@@ -222,7 +220,7 @@ def test_keep_outs_and_a_sun_are_read_and_the_margin_is_left_at_both_ends() -> N
 
 
 @pytest.mark.parametrize(
-    ("more", "place", "words"),
+    ("more", "place", "sentence"),
     [
         ({"margin_rad": 0.6}, "limits.margin_rad", "number from 0 to 0.5"),
         ({"tilt_rad": [0.0, 0.2], "margin_rad": 0.1}, "limits.tilt_rad", "leaves nothing between margins"),
@@ -244,7 +242,9 @@ def test_keep_outs_and_a_sun_are_read_and_the_margin_is_left_at_both_ends() -> N
         ),
     ],
 )
-def test_limits_that_make_no_sense_are_refused_by_place(more: dict[str, Any], place: str, words: str) -> None:
+def test_limits_that_make_no_sense_are_refused_by_place(
+    more: dict[str, Any], place: str, sentence: str
+) -> None:
     with pytest.raises(BadFile) as refused:
         parsed(with_limits(**more))
-    assert place in str(refused.value) and words in str(refused.value)
+    assert place in str(refused.value) and sentence in str(refused.value)

@@ -132,8 +132,8 @@ def test_the_end_is_bounded_although_everything_hangs(
             camera.hook = hang
         daemon.close()
         assert daemon.service.operations.get(operation).state == "stopped"
-    for words in ("did not confirm", "is given up", "is left behind"):
-        assert words in caplog.text
+    for sentence in ("did not confirm", "is given up", "is left behind"):
+        assert sentence in caplog.text
     hang.let_go()
 
 

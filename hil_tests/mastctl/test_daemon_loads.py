@@ -27,7 +27,7 @@ print(json.dumps(loaded))
 
 
 def test_a_stop_waits_for_no_module_and_a_start_for_no_scipy(tmp_path: object) -> None:
-    told = subprocess.run(
+    outcome = subprocess.run(
         [sys.executable, "-c", ASKS, str(tmp_path)], capture_output=True, text=True, timeout=120.0, check=True
     )
-    assert json.loads(told.stdout) == {"scipy": [], "stop": [], "estop": [], "track/stop": []}
+    assert json.loads(outcome.stdout) == {"scipy": [], "stop": [], "estop": [], "track/stop": []}

@@ -30,11 +30,11 @@ def test_a_signal_that_ends_stops_the_mast_first(tmp_path: Path, name: str) -> N
         daemon.send_signal(signal.Signals[name])
         _, log = daemon.communicate(timeout=NET_S)
     assert (daemon.returncode, "Traceback" in log) == (0, False), log
-    words = (tmp_path / "head.log").read_text().splitlines()
-    assert words[0] == "move"
-    assert words[1].startswith("stop")
-    assert float(words[1].split()[1]) < SHORT_OF_GOAL_RAD
-    assert words[-1] == "close"
+    calls = (tmp_path / "head.log").read_text().splitlines()
+    assert calls[0] == "move"
+    assert calls[1].startswith("stop")
+    assert float(calls[1].split()[1]) < SHORT_OF_GOAL_RAD
+    assert calls[-1] == "close"
 
 
 def test_a_closed_terminal_is_survived_where_nohup_asked_for_it(tmp_path: Path) -> None:
@@ -82,14 +82,14 @@ def test_a_command_that_is_ended_unwinds_once_and_tells_the_signal(
             os.kill(os.getpid(), signal.SIGUSR1)
         finally:
             os.kill(os.getpid(), signal.SIGHUP)  # in the middle of making safe: it is not cut short
-            words.append("made safe")
+            calls.append("made safe")
         return 0
 
-    words: list[str] = []
+    calls: list[str] = []
     before = signal.getsignal(signal.SIGHUP)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mastctl.cli.service.client_of", ended)
         assert main(["status"]) == 128 + signal.SIGUSR1
-    assert words == ["made safe"]
+    assert calls == ["made safe"]
     assert capsys.readouterr().err == "mastctl: interrupted\n"
     assert signal.getsignal(signal.SIGHUP) is before

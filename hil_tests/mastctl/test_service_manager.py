@@ -1,4 +1,4 @@
-"""What a service manager is told: datagrams as sd_notify(3) has them, to a socket of the test's own."""
+"""What a service manager receives: datagrams as sd_notify(3) has them, to a socket of the test's own."""
 
 from __future__ import annotations
 
@@ -97,14 +97,14 @@ def test_a_sign_of_life_needs_a_turn_of_the_head_and_one_of_the_loop(manager: so
     assert messages(manager) == ["WATCHDOG=1"]
     beat.turn()
     loop.run()
-    assert messages(manager) == []  # more often than the manager asks is not told
+    assert messages(manager) == []  # no more often than the manager requests
     now[0] = 2.1
     beat.turn()
     loop.run()
     assert messages(manager) == ["WATCHDOG=1"]
 
 
-def test_a_loop_that_stands_still_is_asked_once_and_not_told_of(manager: socket.socket) -> None:
+def test_a_loop_that_hangs_is_requested_once_and_sends_nothing(manager: socket.socket) -> None:
     now, loop = [0.0], Loop()
     beat = ServiceManager(environment(manager, WATCHDOG_USEC="1000000"), loop.soon, lambda: now[0])
     for _ in range(1000):

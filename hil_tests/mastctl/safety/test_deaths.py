@@ -81,7 +81,7 @@ def bench(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
 
 @contextlib.contextmanager
 def made(driver: str, folder: Path, watchdog: bool = False) -> Iterator[Bench]:
-    """Without its watchdog a head that stands was told to; a starved daemon does not trip it."""
+    """Without its watchdog a head at rest was stopped by a command; a starved daemon does not trip it."""
     with line_alone(driver) as (options, truth):
         if driver == "dynamixel" and not watchdog:
             options |= {"watchdog_s": 0, "reply_timeout_s": LONGEST_REPLY_S}
@@ -194,9 +194,9 @@ def test_a_full_disk_keeps_no_stop_from_the_head_and_latches_later(bench: Bench)
         bench.under_way(client)
         _, hard = resource.prlimit(daemon.pid, resource.RLIMIT_FSIZE)
         resource.prlimit(daemon.pid, resource.RLIMIT_FSIZE, (0, hard))
-        told = client.estop(reason="sparks", name="Ana")
-        assert (told["latched"], told["kept"]) == (True, False)
-        assert "would not survive a restart" in present(told["message"])
+        outcome = client.estop(reason="sparks", name="Ana")
+        assert (outcome["latched"], outcome["kept"]) == (True, False)
+        assert "would not survive a restart" in present(outcome["message"])
         assert "latch_not_kept" in [fault["code"] for fault in client.status()["faults"]]
         bench.stopped_on_the_way()
         until(lambda: client.status()["state"] != "stopping", "the daemon knows that it stands")

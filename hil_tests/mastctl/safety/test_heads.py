@@ -55,7 +55,7 @@ def running(config: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def killed_while_latched(bench: Bench) -> None:
-    """A daemon that told that its emergency stop is kept, and was killed."""
+    """A daemon that answered that its emergency stop is kept, and was killed."""
     with running(bench.config) as daemon, Client(line(daemon)) as client:
         assert client.estop(reason="sparks", name="Ana")["kept"] is True
 

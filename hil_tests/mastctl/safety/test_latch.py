@@ -151,7 +151,7 @@ def test_a_power_cut_while_a_latch_is_written_reads_as_latched(folder: StateFold
         path.write_bytes(b"".join(mixed))
         assert Latch(folder).entries
     path.write_bytes(b"".join([old[parts[0]], *(new[part] for part in parts[1:])]))
-    Latch(folder)  # before its first sector nothing was told; it starts
+    Latch(folder)  # before its first sector nothing was confirmed; it starts
 
 
 # The folder
@@ -176,7 +176,7 @@ def test_systemd_names_the_folder_and_the_configuration_before_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STATE_DIRECTORY", f"{tmp_path / 'one'}:{tmp_path / 'two'}")
-    for named, expected in ((None, tmp_path / "one"), (tmp_path / "told", tmp_path / "told")):
+    for named, expected in ((None, tmp_path / "one"), (tmp_path / "named", tmp_path / "named")):
         made = StateFolder.of(named, tmp_path / "rover.yaml", "http://127.0.0.1:1")
         assert made.path == expected
         made.close()
@@ -199,8 +199,8 @@ def test_after_an_emergency_stop_nothing_moves_whatever_way_it_comes(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     with fake_daemon(monkeypatch, tmp_path, config=KEPT) as (daemon, hardware), Client(daemon.url) as client:
-        told = client.estop(reason="sparks", name="Ana")
-        assert (told["stopped"], told["latched"], told["kept"]) == (True, True, True)
+        outcome = client.estop(reason="sparks", name="Ana")
+        assert (outcome["stopped"], outcome["latched"], outcome["kept"]) == (True, True, True)
         assert ("stop",) in hardware.head.calls  # once more where the head was late to confirm it
         status = client.status()
         assert (status["state"], present(status["estop"])["name"]) == ("stopped", "Ana")
@@ -348,9 +348,9 @@ def test_an_unconfirmed_emergency_stop_is_latched_all_the_same(
     with fake_daemon(monkeypatch, tmp_path, config=KEPT) as (daemon, hardware), Client(daemon.url) as client:
         with monkeypatch.context() as patch:
             patch.setattr(hardware.head, "stop", refuse)
-            with pytest.raises(ClientError, match=r"latched, but the head did not confirm.*cable") as told:
+            with pytest.raises(ClientError, match=r"latched, but the head did not confirm.*cable") as outcome:
                 client.estop(name="Ana")
-            assert told.value.code == "stop_unconfirmed"
+            assert outcome.value.code == "stop_unconfirmed"
         assert present(client.status()["estop"])["name"] == "Ana"
         assert (tmp_path / "state" / FILE).exists()
 
@@ -363,9 +363,9 @@ def test_a_disk_that_hangs_delays_an_emergency_stop_by_little(
         for way in ("write", "overwrite"):
             monkeypatch.setattr(StateFile, way, hang)
         monkeypatch.setattr(stopping_module, "KEPT_S", 0.05)
-        told = client.estop()
-        assert (told["latched"], told["kept"]) == (True, False)
-        assert "would not survive" in present(told["message"])
+        outcome = client.estop()
+        assert (outcome["latched"], outcome["kept"]) == (True, False)
+        assert "would not survive" in present(outcome["message"])
         assert ("stop",) in hardware.head.calls
         (fault,) = client.status()["faults"]
         assert (fault["device"], fault["code"]) == ("state", "latch_not_kept")
@@ -382,10 +382,10 @@ def test_a_second_daemon_of_one_state_folder_does_not_touch_the_head(tmp_path: P
     with daemon_process(tmp_path, config) as daemon:
         line(daemon)
         with daemon_process(tmp_path, config) as second:
-            _, words = second.communicate(timeout=NET_S)
+            _, sentence = second.communicate(timeout=NET_S)
         assert second.returncode == 1
-        assert "is in use by another daemon" in words.splitlines()[-1]
-        assert "Traceback" not in words
+        assert "is in use by another daemon" in sentence.splitlines()[-1]
+        assert "Traceback" not in sentence
 
 
 LATCHES_AND_RELEASES = """

@@ -64,9 +64,9 @@ def test_a_disk_that_refuses_any_one_call_leaves_the_old_or_the_new(
         with Recorder(folder, fail_at=number, error=error).installed() as recorder:
             try:
                 save(folder)
-            except BadFile as told:
+            except BadFile as outcome:
                 refused += 1
-                assert os.strerror(error) in str(told)
+                assert os.strerror(error) in str(outcome)
         assert read(folder) in (OLD, NEW), f"call {number} of {recorder.calls}"
         if ("failed",) not in recorder.calls:
             break
@@ -86,13 +86,13 @@ def test_a_power_cut_at_any_call_leaves_the_old_or_the_new(
     with Recorder(folder).installed() as recorder:
         save(folder)
     states = 0
-    for made, held in crash_states(before, recorder.calls, str(folder)):
+    for made, kept in crash_states(before, recorder.calls, str(folder)):
         for path in folder.iterdir():
             path.unlink()
-        for name, data in held.items():
+        for name, data in kept.items():
             Path(name).write_bytes(data)
         found = read(folder)
-        assert found in (old, NEW), f"after {made} of {recorder.calls}: {sorted(held)}"
+        assert found in (old, NEW), f"after {made} of {recorder.calls}: {sorted(kept)}"
         if made == len(recorder.calls):
             assert found == NEW
         states += 1
@@ -100,7 +100,7 @@ def test_a_power_cut_at_any_call_leaves_the_old_or_the_new(
 
 
 @pytest.mark.parametrize(
-    ("data", "words"),
+    ("data", "sentence"),
     [
         (b"", "is no JSON (its 0 bytes"),
         (b'{"schema": "mastctl/test/1", "val', "is no JSON"),
@@ -112,13 +112,13 @@ def test_a_power_cut_at_any_call_leaves_the_old_or_the_new(
         (b" " * (2 << 20), "is larger than"),
     ],
 )
-def test_what_is_no_state_is_told_in_one_sentence(tmp_path: Path, data: bytes, words: str) -> None:
+def test_what_is_no_state_is_refused_in_one_sentence(tmp_path: Path, data: bytes, sentence: str) -> None:
     file = state(tmp_path)
     file.path.write_bytes(data)
-    with pytest.raises(BadFile) as told:
+    with pytest.raises(BadFile) as outcome:
         file.read()
-    assert words in str(told.value)
-    assert str(file.path) in str(told.value)
+    assert sentence in str(outcome.value)
+    assert str(file.path) in str(outcome.value)
 
 
 def test_a_state_file_is_for_its_user_only(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The socket for stops alone: whoever sits there in silence, a stop comes through, and is answered."""
+"""The socket for stops alone: whatever other clients do, a stop comes through, and is answered."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def stops() -> Stops:
 
 
 @pytest.fixture
-def door(tmp_path: Path, stops: Stops) -> Iterator[StopSocket]:
+def server(tmp_path: Path, stops: Stops) -> Iterator[StopSocket]:
     made = StopSocket(tmp_path / "stop.sock", stops)
     yield made
     made.close()
@@ -68,11 +68,11 @@ def said(path: Path, data: bytes) -> str:
         return answer.decode()
 
 
-def test_one_line_is_carried_out_and_one_line_answered(door: StopSocket, stops: Stops) -> None:
-    assert said(door.path, b"stop\n") == 'stop {"stopped": true, "operation": null}\n'
-    assert '"latched": true' in said(door.path, b"estop Ana: sparks: many\n")
-    assert said(door.path, b"estop\n").startswith("estop {")
-    said(door.path, b"estop smoke\r\n")
+def test_one_line_is_carried_out_and_one_line_answered(server: StopSocket, stops: Stops) -> None:
+    assert said(server.path, b"stop\n") == 'stop {"stopped": true, "operation": null}\n'
+    assert '"latched": true' in said(server.path, b"estop Ana: sparks: many\n")
+    assert said(server.path, b"estop\n").startswith("estop {")
+    said(server.path, b"estop smoke\r\n")
     assert stops.requests == [
         ("stop", None, None),
         ("estop", "sparks: many", "Ana"),
@@ -81,66 +81,68 @@ def test_one_line_is_carried_out_and_one_line_answered(door: StopSocket, stops: 
     ]
 
 
-def test_a_line_that_ends_with_the_senders_side_counts(door: StopSocket) -> None:
-    with peer(door.path) as made:
+def test_a_line_that_ends_with_the_senders_side_counts(server: StopSocket) -> None:
+    with peer(server.path) as made:
         made.sendall(b"stop")
         made.shutdown(socket.SHUT_WR)
         assert made.recv(4096).startswith(b"stop {")
 
 
 @pytest.mark.parametrize("data", [b"\n", b"stop now\n", b"\xff\xfe\n"])
-def test_what_is_no_stop_is_told_what_is_expected(door: StopSocket, stops: Stops, data: bytes) -> None:
-    assert "where 'stop' or 'estop NAME: REASON' is expected" in said(door.path, data)
+def test_what_is_no_stop_is_answered_with_what_is_expected(
+    server: StopSocket, stops: Stops, data: bytes
+) -> None:
+    assert "where 'stop' or 'estop NAME: REASON' is expected" in said(server.path, data)
     assert stops.requests == []
 
 
-def test_a_line_without_end_is_cut_off(door: StopSocket, stops: Stops) -> None:
-    with contextlib.suppress(ConnectionError), peer(door.path) as made:
+def test_a_line_without_end_is_cut_off(server: StopSocket, stops: Stops) -> None:
+    with contextlib.suppress(ConnectionError), peer(server.path) as made:
         made.sendall(b"x" * 100_000)
         assert made.recv(10) == b""
-    assert said(door.path, b"stop\n").startswith("stop {")
+    assert said(server.path, b"stop\n").startswith("stop {")
 
 
-def test_only_its_user_may_connect(door: StopSocket) -> None:
-    assert stat.S_IMODE(door.path.stat().st_mode) == 0o600
+def test_only_its_user_may_connect(server: StopSocket) -> None:
+    assert stat.S_IMODE(server.path.stat().st_mode) == 0o600
 
 
-def test_a_stop_that_fails_says_why(door: StopSocket, stops: Stops) -> None:
+def test_a_stop_that_fails_says_why(server: StopSocket, stops: Stops) -> None:
     def refuse() -> Any:
         raise DriverError("the cable is cut")
 
     stops.hook = refuse
-    assert said(door.path, b"stop\n") == "failed: the cable is cut\n"
+    assert said(server.path, b"stop\n") == "failed: the cable is cut\n"
     with pytest.raises(ValueError, match="the cable is cut"):
-        request(door.path, "stop")
+        request(server.path, "stop")
 
 
 def test_a_stop_that_hangs_keeps_no_other_out(
-    door: StopSocket, stops: Stops, monkeypatch: pytest.MonkeyPatch
+    server: StopSocket, stops: Stops, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     hang = Hang()
     stops.hook = hang
     monkeypatch.setattr(stop_socket_module, "ANSWER_S", 0.1)
     with pytest.raises(NoAnswer, match="may still move"):
-        request(door.path, "stop")
-    assert said(door.path, b"estop Ana: sparks\n").startswith("estop {")
+        request(server.path, "stop")
+    assert said(server.path, b"estop Ana: sparks\n").startswith("estop {")
     hang.let_go()
 
 
 def test_silent_peers_by_the_hundred_do_not_keep_a_stop_out(
-    door: StopSocket, monkeypatch: pytest.MonkeyPatch
+    server: StopSocket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(stop_socket_module._Connection, "timeout", None)
     with contextlib.ExitStack() as stack:
         for _ in range(200):
-            stack.enter_context(peer(door.path))
+            stack.enter_context(peer(server.path))
         for _ in range(20):
-            assert said(door.path, b"stop\n").startswith("stop {")
+            assert said(server.path, b"stop\n").startswith("stop {")
 
 
-def test_silent_peers_are_left_after_a_while(door: StopSocket, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_silent_peers_are_left_after_a_while(server: StopSocket, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stop_socket_module._Connection, "timeout", 0.05)
-    with peer(door.path) as made:
+    with peer(server.path) as made:
         assert select.select([made], [], [], NET_S)[0]
         assert made.recv(10) == b""
 
@@ -150,9 +152,9 @@ def test_a_socket_that_a_dead_daemon_left_is_replaced(tmp_path: Path, stops: Sto
     left = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     left.bind(str(path))
     left.close()
-    door = StopSocket(path, stops)
+    server = StopSocket(path, stops)
     assert said(path, b"stop\n").startswith("stop {")
-    door.close()
+    server.close()
     until(lambda: not path.exists(), "the end")
     with pytest.raises(NoAnswer, match="no daemon listens"):
         request(path, "stop")
@@ -219,9 +221,9 @@ def test_the_commands_work_with_a_broken_configuration(
             stack.callback(folder.close)
             assert folder.path == usual_folder(path, "http://127.0.0.1:8420")
             stops = Stops()
-            door = StopSocket(folder.path / "stop.sock", stops)
-            stack.callback(door.close)
-            folder.note_daemon(path, "http://127.0.0.1:8420", door.path)
+            server = StopSocket(folder.path / "stop.sock", stops)
+            stack.callback(server.close)
+            folder.note_daemon(path, "http://127.0.0.1:8420", server.path)
             asked.append(stops.requests)
         assert main(["stop", "--config", str(config)]) == 0
         assert asked == [[("stop", None, None)], []]

@@ -128,7 +128,7 @@ def serving(folder: Path, cameras: tuple[str, ...] = CAMERAS) -> Iterator[Servic
         service.close()
 
 
-def told(service: Service, camera: str) -> list[str]:
+def faults_of(service: Service, camera: str) -> list[str]:
     """The faults of a camera as the status has them."""
     return [fault["message"] for fault in service.status()["faults"] if fault["device"] == camera]
 
@@ -136,14 +136,14 @@ def told(service: Service, camera: str) -> list[str]:
 def test_the_service_starts_with_a_camera_absent_and_the_others_serve(bench: Bench, tmp_path: Path) -> None:
     bench.before_eye["navcam_left"] = Away(LineLost("nothing at /dev/video7", device="usb camera"))
     with serving(tmp_path) as service:
-        until(lambda: told(service, "navcam_left"), "a fault, although nobody asked for a frame")
-        (words,) = told(service, "navcam_left")
-        assert "nothing at /dev/video7" in words and "joins by itself" in words
+        until(lambda: faults_of(service, "navcam_left"), "a fault, although no frame was requested")
+        (sentence,) = faults_of(service, "navcam_left")
+        assert "nothing at /dev/video7" in sentence and "joins by itself" in sentence
         (fault,) = (one for one in service.status()["faults"] if one["device"] == "navcam_left")
         assert fault["until"] == "the line is back", "the driver called it a lost line"
         with pytest.raises(DriverError, match="nothing at /dev/video7"):
             service.snapshot("navcam_left", fresh=True)
-        assert len(told(service, "navcam_left")) == 1, "one thing wrong is told once"
+        assert len(faults_of(service, "navcam_left")) == 1, "one thing wrong is one fault"
         assert service.snapshot("navcam_right", fresh=True).camera == "navcam_right"
         done = service.steering.point(PointRequest(pan_rad=0.1, tilt_rad=0.0))
         until(lambda: service.operations.get(done.id).state != "running", "the pointing's end")
@@ -153,11 +153,11 @@ def test_the_service_starts_with_a_camera_absent_and_the_others_serve(bench: Ben
 def test_an_absent_camera_joins_by_itself_and_its_fault_goes(bench: Bench, tmp_path: Path) -> None:
     away = bench.before_eye["navcam_left"] = Away(NoReply("no answer"))
     with serving(tmp_path) as service:
-        until(lambda: told(service, "navcam_left"), "a fault")
+        until(lambda: faults_of(service, "navcam_left"), "a fault")
         with pytest.raises(DriverError):
             service.snapshot("navcam_left", fresh=True)
         away.come()
-        until(lambda: not told(service, "navcam_left"), "the fault's end, although nobody asked")
+        until(lambda: not faults_of(service, "navcam_left"), "the fault's end, without a request")
         assert service.snapshot("navcam_left", fresh=True).camera == "navcam_left"
         opened = len([name for name, _ in bench.calls if name == "navcam_left"])
         time.sleep(0.5)
@@ -175,11 +175,11 @@ def test_a_camera_that_joins_with_another_size_is_a_fault_and_not_served(
         away.come()
         until(lambda: "navcam_left" in bench.eyes, "the opening")
         if kind is SmallEye:  # its size shows in its first picture
-            until(lambda: not told(service, "navcam_left"), "joined")
+            until(lambda: not faults_of(service, "navcam_left"), "joined")
         for _ in range(2):
             with pytest.raises(DriverError, match=r"16x12 px where the mast file has 64x48|no answer"):
                 service.snapshot("navcam_left", fresh=True)
-        until(lambda: "16x12 px" in "".join(told(service, "navcam_left")), "the fault")
+        until(lambda: "16x12 px" in "".join(faults_of(service, "navcam_left")), "the fault")
         with pytest.raises(BadFrame):
             service.snapshot("navcam_left", fresh=True)
 
@@ -209,9 +209,9 @@ def test_a_factory_that_blocks_is_named_and_the_service_starts_without_it(
     hang = bench.before_eye["navcam_left"] = Hang()
     with caplog.at_level(logging.WARNING), serving(tmp_path) as service:
         assert "navcam_left: driver 'bench_of_test:eye' is still opening it" in caplog.text
-        until(lambda: told(service, "navcam_left"), "a fault")
-        (words,) = told(service, "navcam_left")
-        assert "driver 'bench_of_test:eye' has been opening it for" in words and "joins" in words
+        until(lambda: faults_of(service, "navcam_left"), "a fault")
+        (sentence,) = faults_of(service, "navcam_left")
+        assert "driver 'bench_of_test:eye' has been opening it for" in sentence and "joins" in sentence
         (fault,) = (one for one in service.status()["faults"] if one["device"] == "navcam_left")
         assert fault["until"] == "it is there, or a picture comes"
         with pytest.raises(DriverError, match="has been opening it for"):
@@ -219,5 +219,5 @@ def test_a_factory_that_blocks_is_named_and_the_service_starts_without_it(
         assert service.snapshot("navcam_right", fresh=True).camera == "navcam_right"
         assert [name for name, _ in bench.calls].count("navcam_left") == 1, "called again beside itself"
         hang.let_go()
-        until(lambda: not told(service, "navcam_left"), "joined")
+        until(lambda: not faults_of(service, "navcam_left"), "joined")
         assert service.snapshot("navcam_left", fresh=True).camera == "navcam_left"

@@ -164,7 +164,7 @@ def test_bad_files_are_refused_with_the_reason(
     daemon.service.devices.sensor_modes["navcam_left"] = SensorMode((64, 48))  # type: ignore[index]
     flipped = replace(left, sensor_mode=SensorMode((64, 48), flip=(True, False)))
     others["mode"] = {**little.cameras, "navcam_left": flipped}
-    words = {
+    sentence = {
         "lacking": "no camera hazcam_left",
         "on": "on the rover",
         "size": "32x24",
@@ -172,8 +172,8 @@ def test_bad_files_are_refused_with_the_reason(
     }
     for name, cameras in others.items():
         save_rig(replace(little, cameras=cameras), folder / f"{name}.yaml")
-        told = refusal(web.post("/mast", json={"file": f"{name}.yaml"}), 422, "bad_mast_file")
-        assert words[name] in told
+        outcome = refusal(web.post("/mast", json={"file": f"{name}.yaml"}), 422, "bad_mast_file")
+        assert sentence[name] in outcome
     assert in_use(web) == before
     # A camera that joins in another mode after two files were in use: neither comes back unasked.
     daemon.service.devices.sensor_modes.pop("navcam_left")  # type: ignore[attr-defined]

@@ -36,15 +36,15 @@ def off_px(daemon: RunningDaemon, clicked_id: str, row: dict[str, Any]) -> np.nd
     return np.asarray(rover.true_pixel(*camera_and_sequence(str(row["frame_id"])), point) - row["aim_px"])
 
 
-@pytest.mark.parametrize("told", [{"plane": {"point_m": [0.0, 0.0, 0.0]}}, {}])
+@pytest.mark.parametrize("given", [{"plane": {"point_m": [0.0, 0.0, 0.0]}}, {}])
 def test_a_pixel_is_pointed_at_and_the_second_time_well(
-    daemon: RunningDaemon, told: dict[str, object]
+    daemon: RunningDaemon, given: dict[str, object]
 ) -> None:
     with Client(daemon.url) as client:
         client.wait(client.point(pan_rad=0.1, tilt_rad=-0.2))
         shot = client.snapshot("navcam")
         record: Any = client.wait(
-            client.point(pixel=("navcam", shot.frame_id, *CLICK), pointings=2, **told)  # type: ignore[arg-type]
+            client.point(pixel=("navcam", shot.frame_id, *CLICK), pointings=2, **given)  # type: ignore[arg-type]
         )
     assert record["state"] == "done", record["error"]
     first, second = (off_px(daemon, shot.frame_id, row) for row in record["pointings"])
@@ -53,7 +53,7 @@ def test_a_pixel_is_pointed_at_and_the_second_time_well(
         away = off + row["aim_px"] - row["predicted_px"]
         assert away @ np.linalg.solve(row["predicted_covariance_px2"], away) < 9.2
     assert np.abs(second).max() < 0.5
-    assert record["range_from"] == ("plane" if told else "parallax")
+    assert record["range_from"] == ("plane" if given else "parallax")
     assert record["range_interval_m"][0] <= record["range_m"]
     kinds = [step["name"] for step in record["steps"]]
     assert kinds.count("range") == 2 and "stereo" not in kinds

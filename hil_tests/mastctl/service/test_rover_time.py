@@ -42,17 +42,17 @@ def ended(service: Service, name: str) -> Any:
 
 def a_run(seed: int, pause_s: float) -> tuple[str, list[np.ndarray[Any, Any]]]:
     """A little campaign, with pauses that differ between runs: its record and its pictures."""
-    told, pictures = list[Any](), []
+    outcome, pictures = list[Any](), []
     with service_at("max", seed=seed) as service:
         for u_px, v_px in ((300.0, 420.0), (700.0, 500.0)):
             time.sleep(pause_s)
             frame = service.snapshot("navcam_left", fresh=True)
             pictures.append(frame.image)
             request = PointRequest(pixel=PixelTarget("navcam_left", frame.frame_id, u_px, v_px))
-            told.append(ended(service, service.steering.point(request).id))
+            outcome.append(ended(service, service.steering.point(request).id))
             time.sleep(pause_s)
-        told.append(service.status())
-    return json.dumps(told, sort_keys=True), pictures
+        outcome.append(service.status())
+    return json.dumps(outcome, sort_keys=True), pictures
 
 
 @pytest.mark.long(1, "three daemons that point on rendered pictures")
@@ -67,15 +67,15 @@ def test_runs_of_one_seed_are_equal_to_the_last_bit() -> None:
 def test_the_head_takes_its_time_on_the_rovers_clock_only() -> None:
     with service_at("max") as service:
         began_s = service.clock.now_s()
-        told = ended(service, service.steering.point(PointRequest(pan_rad=2.0, tilt_rad=-0.5)).id)
-        assert told["state"] == "done"
-        assert told["steps"]
-        times_s = [began_s, told["created_s"], told["started_s"]]
-        for step in told["steps"]:
+        outcome = ended(service, service.steering.point(PointRequest(pan_rad=2.0, tilt_rad=-0.5)).id)
+        assert outcome["state"] == "done"
+        assert outcome["steps"]
+        times_s = [began_s, outcome["created_s"], outcome["started_s"]]
+        for step in outcome["steps"]:
             times_s += [step["started_s"], step["started_s"] + step["duration_s"]]
-        times_s += [told["ended_s"], service.clock.now_s()]
+        times_s += [outcome["ended_s"], service.clock.now_s()]
         assert np.diff(times_s).min() > -2e-3, f"times out of order: {times_s}"  # rounded to a millisecond
-        took_s = told["ended_s"] - told["started_s"]
+        took_s = outcome["ended_s"] - outcome["started_s"]
         assert took_s > 2.0  # 2 rad at 1 rad/s
         assert service.clock.now_s() >= began_s + took_s
         before_s = service.clock.now_s()
@@ -98,6 +98,6 @@ def test_a_stop_overtakes_a_move_that_nobody_waits_for() -> None:
             moving = service.steering.point(PointRequest(pan_rad=2.5, tilt_rad=0.0)).id
             service.clock.sleep(1.0)
             service.stopping.stop()
-        told = ended(service, moving)
-        assert (told["state"], told["error"]["code"]) == ("stopped", "stopped")
+        outcome = ended(service, moving)
+        assert (outcome["state"], outcome["error"]["code"]) == ("stopped", "stopped")
         assert 0.2 < service.devices.read().pan_rad < 2.0

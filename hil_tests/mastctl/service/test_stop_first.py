@@ -1,4 +1,4 @@
-"""Stop comes first: whatever hangs, is locked or raises, the head is told, and what runs ends at once."""
+"""Stop comes first: whatever hangs, is locked or raises, the head is stopped, and what runs ends at once."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def asked_to_stop(daemon: RunningDaemon) -> threading.Thread:
     return asking
 
 
-def test_the_head_is_told_before_the_track_and_before_any_word(
+def test_the_head_is_stopped_before_the_track_and_before_any_log(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     hang = Hang()
@@ -49,7 +49,7 @@ def test_the_head_is_told_before_the_track_and_before_any_word(
         logger.setLevel(logging.INFO)
         stopping = asked_to_stop(daemon)
         try:
-            until(lambda: ("stop",) in hardware.head.calls, "the head is told, while the words hang")
+            until(lambda: ("stop",) in hardware.head.calls, "the head is stopped, while the log hangs")
         finally:
             logger.removeHandler(handler)
             logger.setLevel(before)
@@ -127,7 +127,7 @@ def test_a_fifth_stop_is_answered_honestly_while_four_hang(
     with fake_daemon(monkeypatch, tmp_path) as (daemon, _):
         monkeypatch.setattr(commands_module, "STOP_ANSWER_S", 0.5)
         monkeypatch.setattr(daemon.service.stopping, "stop", hang)
-        told: list[ClientError] = []
+        outcome: list[ClientError] = []
         four = [asked_to_stop(daemon) for _ in range(4)]
 
         def refused() -> bool:
@@ -135,12 +135,12 @@ def test_a_fifth_stop_is_answered_honestly_while_four_hang(
                 try:
                     client.stop()
                 except ClientError as error:
-                    told.append(error)
-            return bool(told) and "4 stops are under way" in str(told[-1])
+                    outcome.append(error)
+            return bool(outcome) and "4 stops are under way" in str(outcome[-1])
 
         until(refused, "an answer to the fifth")
-        assert told[-1].code == "stop_pending"
-        assert "may still move" in str(told[-1])
+        assert outcome[-1].code == "stop_pending"
+        assert "may still move" in str(outcome[-1])
         hang.let_go()
         joined(*four)
 

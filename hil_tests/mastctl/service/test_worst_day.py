@@ -35,7 +35,7 @@ def worst_day(**head: Any) -> Iterator[Service]:
 
 
 def pointed(service: Service, pixel_px: tuple[float, float]) -> tuple[Any, np.ndarray[Any, Any]]:
-    """A click, pointed at: what was told, and where the clicked thing is in a picture of later, px off."""
+    """A click, pointed at: the operation, and where the clicked thing is in a picture of later, px off."""
     frame = service.snapshot("navcam_left", fresh=True)
     rover = service.hardware.simulation
     assert rover is not None
@@ -44,26 +44,26 @@ def pointed(service: Service, pixel_px: tuple[float, float]) -> tuple[Any, np.nd
         PointRequest(pixel=PixelTarget("navcam_left", frame.frame_id, *pixel_px), pointings=2)
     ).id
     until(lambda: service.operations.get(name).ended_s is not None, f"the end of operation {name}")
-    told = service.operations.get(name).as_json()
+    outcome = service.operations.get(name).as_json()
     service.clock.sleep(30.0)  # until nothing rings any more
     later = service.snapshot("navcam_left", fresh=True)
-    return told, np.asarray(rover.true_pixel("navcam_left", later.sequence, point_m)) - AIM_PX
+    return outcome, np.asarray(rover.true_pixel("navcam_left", later.sequence, point_m)) - AIM_PX
 
 
 @pytest.mark.long(1, "the worst day is rendered with all its lenses and light")
 def test_on_the_worst_day_the_second_pointing_lands_and_tells_the_truth() -> None:
     with worst_day() as service:
         for pixel_px in CLICKS:
-            told, truly_px = pointed(service, pixel_px)
-            assert told["state"] == "done", told["error"]
+            outcome, truly_px = pointed(service, pixel_px)
+            assert outcome["state"] == "done", outcome["error"]
             assert np.abs(truly_px).max() < 0.4
-            off_px = np.abs(truly_px - told["residual_px"])
-            assert (off_px < 3.0 * np.array(told["residual_sigma_px"])).all()
+            off_px = np.abs(truly_px - outcome["residual_px"])
+            assert (off_px < 3.0 * np.array(outcome["residual_sigma_px"])).all()
 
 
 @pytest.mark.long(1, "the worst day is rendered with all its lenses and light")
-def test_who_does_not_let_the_mast_settle_is_told_no_residual() -> None:
+def test_a_mast_that_does_not_settle_yields_no_residual() -> None:
     with worst_day(settle_s=0.0) as service:
         for pixel_px in CLICKS:
-            told, _ = pointed(service, pixel_px)
-            assert told["state"] == "failed" and told["error"]["code"] == "not_repeated", told
+            outcome, _ = pointed(service, pixel_px)
+            assert outcome["state"] == "failed" and outcome["error"]["code"] == "not_repeated", outcome
