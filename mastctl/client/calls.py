@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import ssl
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import urlencode
 
 from mastctl import answers
-from mastctl.client.connection import PREFIX, Broken, ClientError, DaemonHttp, escaped, given, trusted
+from mastctl.client.connection import PREFIX, Broken, ClientError, DaemonHttp, escaped, given
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
@@ -218,7 +219,7 @@ class Calls:
             if path is not None:
                 line = unix_connect(path, address, **options)
             else:
-                secure = trusted() if address.startswith("wss") else None
+                secure = ssl.create_default_context() if address.startswith("wss") else None
                 line = connect(address, proxy=None, ssl=secure, **options)
         except (InvalidHandshake, InvalidURI) as error:
             raise ClientError(

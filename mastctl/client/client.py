@@ -64,8 +64,8 @@ class Client(LeaseCalls, Calls):
     ``url``: ``http://127.0.0.1:8420``, or ``unix:/path/of/socket``. ``timeout_s``: longest time of each
     request. ``name`` of this program, for the daemon's record and for other clients that want to steer, is by
     default ``program@host:pid``; clients of one name are one party. ``token``: expected by a daemon from
-    other machines; by default ``$MASTCTL_TOKEN``. Others can read it on the way without TLS. The file
-    ``$MASTCTL_CA_FILE`` may name further certificates.
+    other machines; by default ``$MASTCTL_TOKEN``. Others can read it on the way without TLS, of
+    which ``$SSL_CERT_FILE`` may name the certificates.
 
     Where the connection breaks, the client sends a command again; its key lets the daemon execute it once.
     Every method raises ClientError for whatever goes wrong.

@@ -45,19 +45,6 @@ class ClientError(Exception):
         super().__init__(message)
 
 
-def trusted() -> ssl.SSLContext:
-    """Return the trusted certificates: the machine's, and ``$MASTCTL_CA_FILE``. Raises ClientError."""
-    context = ssl.create_default_context()
-    ca_file = os.environ.get("MASTCTL_CA_FILE")
-    if ca_file:
-        try:
-            context.load_verify_locations(ca_file)
-        except (OSError, ssl.SSLError) as error:
-            reason = f"MASTCTL_CA_FILE: {ca_file}: no certificates can be read ({error})"
-            raise ClientError("bad_url", reason, exit_code=2) from None
-    return context
-
-
 class Broken(ClientError):
     """The connection broke: whether the daemon got the request is not known."""
 
@@ -230,7 +217,7 @@ class DaemonHttp:
                 headers=self.shown,
                 trust_env=False,
                 transport=None if path is None else httpx.HTTPTransport(uds=path),
-                verify=trusted() if parts.scheme == "https" else False,
+                verify=ssl.create_default_context() if parts.scheme == "https" else False,
             )
         except (ValueError, httpx.InvalidURL):
             raise ClientError(
