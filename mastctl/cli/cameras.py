@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli.options import command, option, positive_number
+from mastctl.cli.options import command, option
 from mastctl.cli.output import Answer, Shown, WrongUse, check_file, tables_at, tell
 
 if TYPE_CHECKING:
@@ -87,15 +87,12 @@ def camera_check(args: argparse.Namespace) -> Answer:
     "camera grab",
     *CAMERA,
     option("--out FILE.png", "image to write", required=True),
-    option("--aim X Y", "mark this pixel"),
     help="one fresh picture as PNG, with its time in it",
     example="/dev/video0 --out picture.png",
 )
 def camera_grab(args: argparse.Namespace) -> Answer:
-    """Write one fresh picture; a cross marks --aim and leaves the pixel itself free."""
-    import cv2
-
-    from mastctl.report.pictures import encoded, in_colour, with_text
+    """Write one fresh picture."""
+    from mastctl.report.pictures import encoded, with_text
 
     check_file(args.out, "--out")
     with opened_camera(args) as (camera, _):
@@ -107,14 +104,8 @@ def camera_grab(args: argparse.Namespace) -> Answer:
         "mid_exposure_s": repr(frame.mid_exposure_s),
         "exposure_s": repr(frame.exposure_s),
     }
-    image = frame.image
-    if args.aim is not None:
-        image = in_colour(image)
-        x, y = map(round, args.aim)
-        for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            cv2.line(image, (x + 4 * dx, y + 4 * dy), (x + 16 * dx, y + 16 * dy), (0, 255, 255), 1)
-    args.out.write_bytes(with_text(encoded(image, "png"), facts))
-    return Answer({"out": str(args.out), "size_px": [image.shape[1], image.shape[0]], **facts})
+    args.out.write_bytes(with_text(encoded(frame.image, "png"), facts))
+    return Answer({"out": str(args.out), "size_px": list(frame.image.shape[1::-1]), **facts})
 
 
 @command(
@@ -152,16 +143,7 @@ def camera_focus(args: argparse.Namespace) -> Answer:
     option("[NAME...]", "cameras on the head (default: all of the configuration)", dest="cameras"),
     option("--config FILE", "default: the packaged simulated rover"),
     option("--seconds S", "how long it turns", default=30.0),
-    option(
-        "--amplitude RAD",
-        "how far pan goes to a side (default 0.07, or 0.15 of a view)",
-        type=positive_number,
-    ),
-    option(
-        "--speed RAD_PER_S",
-        "of the fastest turns (default five amplitudes a second)",
-        type=positive_number,
-    ),
+    option("--amplitude RAD", "how far pan goes to a side (default 0.07, or 0.15 of a view)"),
     help="measure how late the stamps are against the joints; turns the head to and fro",
     example="navcam_left navcam_right --config rover.yaml",
 )
@@ -185,7 +167,7 @@ def camera_sync(args: argparse.Namespace) -> Answer:
     if not on_head:
         raise WrongUse(f"{config.path} has no camera on the head")
     names = list(dict.fromkeys(args.cameras)) or on_head
-    plan = plan_sweep(rig, names, config.limits, args.amplitude, args.speed, args.seconds)
+    plan = plan_sweep(rig, names, config.limits, args.amplitude, args.seconds)
     settings, clock = with_cameras(config, names), SystemClock()
     opened = devices_beside(settings, bounds, clock, moves=True, own_cameras=True)
     with opened as (devices, cameras):

@@ -85,20 +85,12 @@ class Option(NamedTuple):
     names: list[str]
     settings: dict[str, Any]
 
-    def add_to(self, parser: Any) -> None:
-        """Declare it to a parser or a group of one."""
-        parser.add_argument(*self.names, **self.settings)
-
 
 class OneOf(NamedTuple):
-    """Options of which one at most may be given, or exactly one."""
+    """Options of which one at most may be given, or exactly one; `one_of` makes it."""
 
     options: tuple[Option, ...]
     required: bool
-
-    def add_to(self, parser: Any) -> None:
-        """Declare them to a parser."""
-        add_options(parser.add_mutually_exclusive_group(required=self.required), *self.options)
 
 
 def one_of(*options: Option, required: bool = False) -> OneOf:
@@ -185,9 +177,12 @@ def command(
 
 
 def add_options(parser: Any, *options: Option | OneOf) -> None:
-    """Add declared options to a parser of argparse."""
+    """Add declared options to a parser of argparse, or to a group of one."""
     for one in options:
-        one.add_to(parser)
+        if isinstance(one, OneOf):
+            add_options(parser.add_mutually_exclusive_group(required=one.required), *one.options)
+        else:
+            parser.add_argument(*one.names, **one.settings)
 
 
 # argparse's own pattern knows -1 and -1.5 but takes -1e-3 for an option; "not finite" texts get our message.

@@ -53,14 +53,9 @@ class Request(NamedTuple):
         with client_of(args) as client:
             if isinstance(self.send, str):
                 method, path, *names = self.send.split()
-                given = {
-                    name: quote(value, safe="")
-                    for name, value in vars(args).items()
-                    if isinstance(value, str)
-                }
-                answer = client.request(
-                    method, path.format_map(given), **{n: getattr(args, n) for n in names}
-                )
+                texts = {name: quote(str(value), safe="") for name, value in vars(args).items()}
+                body = {name: getattr(args, name) for name in names}
+                answer = client.request(method, path.format_map(texts), **body)
             else:
                 answer = dict(self.send(client, args))
         if self.line:

@@ -79,7 +79,6 @@ def plan_sweep(
     cameras: Sequence[str],
     limits: Limits,
     amplitude_rad: float | None,
-    speed_rad_per_s: float | None,
     seconds: float,
 ) -> SweepPlan:
     """Return a sweep that the cameras' views allow, as far as it was not requested otherwise."""
@@ -87,9 +86,7 @@ def plan_sweep(
         models = [rig.cameras[name].model for name in cameras]
         narrowest = min(2 * math.atan(one.size_px[0] / 2 / one.focal_px[0]) for one in models)
         amplitude_rad = min(USUAL_AMPLITUDE_RAD, MOST_OF_VIEW * narrowest)
-    if speed_rad_per_s is None:
-        speed_rad_per_s = min(USUAL_SPEED * amplitude_rad, limits.speed_rad_per_s)
-    return SweepPlan(amplitude_rad, speed_rad_per_s, seconds)
+    return SweepPlan(amplitude_rad, min(USUAL_SPEED * amplitude_rad, limits.speed_rad_per_s), seconds)
 
 
 class Sweep:
