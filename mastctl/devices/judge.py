@@ -249,14 +249,17 @@ class KeepOutJudge:
     def use_rig(self, rig: Rig) -> None:
         """Judge the sun by another mast file's cameras."""
         self._rig = rig
+        self._now()  # made here, so that no move and no stop behind it waits for that
 
     def use_sun(self, sun: SunDirection | None) -> None:
         """Keep another direction out, or none."""
         self._sun = sun
+        self._now()
 
     def rover_stands(self, rover_from_site: FloatArray) -> None:
         """Turn a sun of the site frame with the rover, (3, 3)."""
         self._rover_from_site = rover_from_site
+        self._now()
 
     def check_goal(self, pan_rad: float, tilt_rad: float) -> None:
         """Pass joint angles that may be a goal. Raises OutsideLimits, KeptOut."""
