@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -24,7 +24,6 @@ from calib.plan.knowledge import BenchShot
 from calib.plan.placements import Advice, Placement, advise, advise_for_body, first_placement
 from calib.plan.poses import AttitudeChoice, candidates, next_shot
 from calib.targets.boards import Corners
-from mastctl.answers import BenchProgress, BenchStep
 from mastctl.bench.known import BenchKnowledge
 from mastctl.bench.mast import (
     BenchInterrupted,
@@ -62,12 +61,8 @@ class Reporter(Protocol):
         """Show a sentence."""
         ...
 
-    def step(self, step: BenchStep) -> None:
-        """Show what is done from now on."""
-        ...
-
-    def progress(self, now: BenchProgress) -> None:
-        """Show how far the run is."""
+    def change(self, **changed: Any) -> None:
+        """Show what has changed of the run (`mastctl.answers.BenchRunRecord`)."""
         ...
 
     def place(self, name: str, placement: Placement) -> None:
@@ -169,7 +164,6 @@ class BenchRun:
             self._reporter.place(name, placement)
             if self._simulated is not None:
                 self._simulated.stand(placement)
-            self._reporter.step("search")
             known.take(name, find_board(self._mast, known.now, known.sought, self._reporter.say, placement))
             self._work_at(name)
         return known.fit()
@@ -180,6 +174,7 @@ class BenchRun:
         Raises MastctlError as `run`.
         """
         known, name = self.known, self.known.placements()[-1]
+        self._reporter.change(step="check")
         if self._current != name and not self._stands_still(name):
             self._reporter.say(f"not checked: the board does not stand any more as in placement {name}")
             return Checked({}, ())
@@ -193,6 +188,7 @@ class BenchRun:
                 known.take(name, look, check=True)
         looks = known.of(name, check=True)
         pointings = tuple(islice(self._pointings(name, looks), POINTINGS))
+        self._reporter.change(step="fit")
         return Checked(known.promised_px(looks, name), pointings)
 
     def _unvisited(self, name: str, count: int) -> Iterator[BenchShot]:
@@ -266,7 +262,7 @@ class BenchRun:
         self._reporter.say(
             f"going on with {known.folder.path}: {known.pictures()} pictures a camera are there"
         )
-        self._reporter.step("fit")
+        self._reporter.change(step="fit")
         known.believe_boards()
         known.try_fit()
         self._report(None)
@@ -323,7 +319,7 @@ class BenchRun:
         known, self._current = self.known, name
         left = max(PLACEMENTS[0] + 1 - len(known.placements()), 1)
         most = max(FEWEST_LOOKS, self._looks_left() // left)
-        self._reporter.step("pictures")
+        self._reporter.change(step="pictures")
         in_vain: list[tuple[float, float]] = []
         missed = 0
         while True:
@@ -390,7 +386,7 @@ class BenchRun:
         return choice.expected_px > (1.0 - (LAST_GAIN if last else LITTLE_GAIN)) * now_px
 
     def _report(self, choice: AttitudeChoice | None) -> None:
-        self._reporter.progress(self.known.progress(self._target_px(), choice))
+        self._reporter.change(**self.known.progress(self._target_px(), choice))
 
 
 def corners_apart_px(then: BenchLook, now: BenchLook) -> float | None:

@@ -10,13 +10,11 @@ from __future__ import annotations
 import logging
 import math
 import os
-import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any, cast
 
 from calib.adjust.result import BenchCalibration
@@ -24,7 +22,8 @@ from calib.geometry.rig import Rig
 from calib.plan.placements import Placement
 from calib.survey.records import Survey
 from calib.targets.board_file import load_board
-from mastctl.answers import BenchProgress, BenchResult, BenchRunRecord, BenchStep
+from mastctl import signals
+from mastctl.answers import BenchResult, BenchRunRecord
 from mastctl.as_json import as_json
 from mastctl.bench.known import BenchKnowledge
 from mastctl.bench.mast import DaemonMast, SimulatedBoard
@@ -50,6 +49,7 @@ MOST_ON_CURVE = 600
 def work(job: BenchJob, link: Connection) -> None:
     """Carry a run out. Sends it through ``link`` at each change; receives True when a board stands."""
     os.nice(BESIDE)
+    signals.end_with_parent()  # its lease is not renewed any more
     reporter = LinkReporter(job.run, link)
     try:
         with Client(job.url, name=HOLDER, token=job.token) as client:
@@ -63,11 +63,11 @@ def work(job: BenchJob, link: Connection) -> None:
             simulated = SimulatedBoard(client, board, mast.head.rig) if job.run["simulated"] else None
             run = BenchRun(mast, known, reporter, job.run["wanted_px"], job.run["most"], simulated)
             run.run()
-            reporter.step("check")
             checked = run.check()
-            reporter.step("fit")
             report = job.folder.page.parent
-            reporter.done(saved(folder.survey(), known.fit(), mast.head.rig, job.out, report, checked))
+            document = saved(folder.survey(), known.fit(), mast.head.rig, job.out, report, checked)
+            reporter.change(result={key: document.get(key) for key in BenchResult.__annotations__})
+            reporter.end("done", None, f"verdict: {document['verdict']['words']}")
     except Exception as error:
         body = error_body(error)
         if body["code"] == "internal":
@@ -76,19 +76,18 @@ def work(job: BenchJob, link: Connection) -> None:
 
 
 class LinkReporter:
-    """Keeps a run up to date and sends it to the daemon at each change; see `Reporter`.
-
-    The process ends with the link: the lease is not renewed any more.
-    """
+    """Keeps a run up to date and sends it to the daemon at each change; see `Reporter`."""
 
     def __init__(self, run: BenchRunRecord, link: Connection) -> None:
         self.run, self._link = run, link
-        self._stands: SimpleQueue[bool] = SimpleQueue()
-        threading.Thread(target=self._receive, name="bench answers", daemon=True).start()
 
     def change(self, **changed: Any) -> None:
         """Send the run with some of its fields changed."""
-        self.run = cast(BenchRunRecord, {**self.run, **changed})
+        run = {**self.run, **changed}
+        if changed.get("predicted_px") is not None:
+            before = [one for one in run["curve"] if one[0] < run["pictures"]]
+            run["curve"] = [*before, [float(run["pictures"]), run["predicted_px"]]][-MOST_ON_CURVE:]
+        self.run = cast(BenchRunRecord, run)
         self._link.send(self.run)
 
     def say(self, sentence: str) -> None:
@@ -96,22 +95,11 @@ class LinkReporter:
         sentences = [*self.run["sentences"], one_line(sentence, LONGEST_SENTENCE)]
         self.change(sentences=sentences[-MOST_SENTENCES:])
 
-    def step(self, step: BenchStep) -> None:
-        """Send what is done from now on."""
-        self.change(step=step, state="running")
-
-    def progress(self, now: BenchProgress) -> None:
-        """Send how far the run is."""
-        curve = [one for one in self.run["curve"] if one[0] < now["pictures"]]
-        if now["predicted_px"] is not None:
-            curve.append([float(now["pictures"]), now["predicted_px"]])
-        self.change(curve=curve[-MOST_ON_CURVE:], **now)
-
     def place(self, name: str, placement: Placement) -> None:
         """Request a placement, and wait until a client confirms that the board stands."""
         by_hand = self.run["by_hand"]
-        while by_hand and not self._stands.empty():
-            self._stands.get()  # of a placement before
+        while self._link.poll():
+            self._link.recv()  # of a placement before
         described = {**as_json(placement), "description": str(placement), "needs_confirmation": by_hand}
         self.change(
             requested={"name": name, **described},
@@ -120,26 +108,13 @@ class LinkReporter:
             state="waiting" if by_hand else "running",
         )
         if by_hand:
-            self._stands.get()
-        self.step("search")
-
-    def done(self, document: Mapping[str, Any]) -> None:
-        """Send the result; ``document`` is what the command prints with ``--json``."""
-        result = {key: document.get(key) for key in BenchResult.__annotations__}
-        self.change(result=result)
-        self.end("done", None, f"verdict: {document['verdict']['words']}")
+            self._link.recv()
+        self.change(step="search", state="running")
 
     def end(self, state: str, code: str | None, sentence: str) -> None:
         """Send the end."""
         self.say(sentence)
         self.change(state=state, step="over", code=code, sentence=self.run["sentences"][-1])
-
-    def _receive(self) -> None:
-        try:
-            while True:
-                self._stands.put(self._link.recv())
-        except (EOFError, OSError):
-            os._exit(1)
 
 
 def fit_again(

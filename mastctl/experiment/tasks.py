@@ -8,15 +8,15 @@ those that this program starts: more threads add up in another order.
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
 from typing import Any, TypeVar, cast
 
 import cv2
 
+from mastctl import signals
 from mastctl.errors import MastctlError
 
 Task = TypeVar("Task")
@@ -116,11 +116,4 @@ def open_executor(name: str = "local", workers: int | None = None) -> Iterator[E
 def _begin() -> None:
     """Have a worker use one thread, and end when the process that started it is gone."""
     cv2.setNumThreads(1)
-    parent = parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=watch, name="end with parent", daemon=True).start()
+    signals.end_with_parent()

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,7 +18,6 @@ from calib.geometry.rigid import FloatArray, Rigid
 from calib.plan.placements import Placement
 from calib.targets.boards import AnyBoard, Corners
 from hil_tests.support.sim_survey.plan import rover_from_head
-from mastctl.answers import BenchProgress
 from mastctl.bench.mast import BenchHead, BenchLook, SeenBoard
 
 EDGE_PX = 3.0
@@ -128,18 +128,16 @@ class SelfPlacing:
 
     bench: CornerBench
     sentences: list[str] = field(default_factory=list)
-    shown: list[BenchProgress] = field(default_factory=list)
+    shown: list[dict[str, Any]] = field(default_factory=list)
 
     def say(self, sentence: str) -> None:
         """Keep it."""
         self.sentences.append(sentence)
 
-    def step(self, step: str) -> None:
-        """Pass over it."""
-
-    def progress(self, now: BenchProgress) -> None:
-        """Keep it."""
-        self.shown.append(now)
+    def change(self, **changed: Any) -> None:
+        """Keep how far it is."""
+        if "placements" in changed:
+            self.shown.append(changed)
 
     def place(self, name: str, placement: Placement) -> None:
         """Put the board there."""
