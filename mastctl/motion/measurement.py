@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from calib.errors import CalibError
-from calib.geometry.cahvor import CameraModel
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
 from calib.matching.partner import UP, StereoMatch, find_partner
@@ -83,12 +82,7 @@ class RigCameras:
     not compared: in between the rover may have been driven.
     """
 
-    def __init__(
-        self,
-        devices: Devices,
-        rig: Rig,
-        check: Callable[[], None] = lambda: None,
-    ) -> None:
+    def __init__(self, devices: Devices, rig: Rig, check: Callable[[], None] = lambda: None) -> None:
         self._devices = devices
         self._rig = rig
         self._check = check
@@ -229,7 +223,10 @@ class RigCameras:
         turned = max(
             abs(view.frame.pan_rad - now.frame.pan_rad), abs(view.frame.tilt_rad - now.frame.tilt_rad)
         )
-        planes = [_plane_at(view.camera, pixel_px, range_m) for range_m in (1.0, 2.0, 1e3)]
+        try:
+            planes = [facing_plane(view.camera, pixel_px, range_m) for range_m in (1.0, 2.0, 1e3)]
+        except CalibError as error:  # a pixel without a ray
+            raise PointingError("outside_image", str(error)) from None
         if turned <= SAME_POSE_RAD:
             return _good(match_patch(view, pixel_px, planes[1], now, 12.0, MATCH), now)
         places = np.array([carry(pixel_px, view.camera, plane, now.camera)[0] for plane in planes])
@@ -254,9 +251,7 @@ class RigCameras:
         Raises PointingError ``target_...``, ``eyes_disagree`` if it lies off the line.
         """
         found = find_partner(view, pixel_px, other, NEAREST_M, MATCH)
-        if found.match.verdict in ("weak", "ambiguous", "flat"):
-            raise _refusal(found.match, other, BESIDE)
-        _good(found.match, other)
+        _good(found.match, other, "" if found.match.verdict == "border" else BESIDE)
         if abs(found.across_px) > ACROSS_PX + 5.0 * found.across_sigma_px:
             raise PointingError(
                 "eyes_disagree",
@@ -405,16 +400,8 @@ def _contradiction(shown: ShownView, before: Posed, after: Posed) -> str:
             f"the picture shows nothing of what {shown.expected} places of the picture before should show at "
             f"{expected}: joints and pictures contradict each other"
         )
-    start, goal = np.array(before.angles_rad), np.array(after.angles_rad)
-    seen, way = np.array([shown.pan_rad, shown.tilt_rad]), goal - start
-    allowed = np.array(shown.allowed_rad)
-    why = ""
-    if (np.abs(seen - start) <= allowed).all():
-        why = ", that of before the move"
-    elif way.any():
-        share = float(np.clip((seen - start) @ way / (way @ way), 0.0, 1.0))
-        if (np.abs(start + share * way - seen) <= allowed).all():
-            why = f", one on the way there ({100 * share:.0f} %)"
+    off_rad = np.array([shown.pan_rad, shown.tilt_rad]) - np.array(before.angles_rad)
+    why = ", that of before the move" if (np.abs(off_rad) <= np.array(shown.allowed_rad)).all() else ""
     return (
         f"the picture shows the view of pan {shown.pan_rad:.3f}, tilt {shown.tilt_rad:.3f} rad{why}, not of "
         f"{expected} ({shown.off_px:.0f} px off): joints and pictures contradict each other"
@@ -427,22 +414,10 @@ def _best(found: Sequence[PatchMatch]) -> PatchMatch:
     return min(found, key=lambda one: (ranks[one.verdict], -one.correlation))
 
 
-def _good(found: PatchMatch, view: CameraView) -> PatchMatch:
+def _good(found: PatchMatch, view: CameraView, advice: str = "") -> PatchMatch:
     """Pass a good match. Raises PointingError with the verdict in its code."""
     if found.verdict == "good":
         return found
-    raise _refusal(found, view)
-
-
-def _refusal(found: PatchMatch, view: CameraView, advice: str = "") -> PointingError:
     code = "target_not_found" if found.verdict == "weak" else f"target_{found.verdict}"
     message = f"the target is not found in the image of {view.frame.camera}: {found.reason}{advice}"
-    return PointingError(code, message)
-
-
-def _plane_at(camera: CameraModel, pixel_px: FloatArray, range_m: float) -> Plane:
-    """The facing plane at a range. Raises PointingError for a pixel without a ray."""
-    try:
-        return facing_plane(camera, pixel_px, range_m)
-    except CalibError as error:
-        raise PointingError("outside_image", str(error)) from None
+    raise PointingError(code, message)

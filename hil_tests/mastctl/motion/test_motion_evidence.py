@@ -212,7 +212,6 @@ def test_a_picture_that_moved_too_little_too_far_or_the_other_way_is_told(share:
     shown, told = angles_told(str(error))
     assert shown == pytest.approx((share * pan, -0.45 + share * (tilt + 0.45)), abs=SAME_RAD)
     assert told == pytest.approx((pan, tilt), abs=1e-3)
-    assert ("on the way" in str(error)) == (0.0 < share < 1.0)
 
 
 @pytest.mark.parametrize("eye", ["navcam_left", "navcam_right"])
