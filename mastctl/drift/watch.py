@@ -33,7 +33,7 @@ from mastctl.drift.evidence import DAY_S, DAYS, KEPT, TOO_FEW, Judged, Windows, 
 from mastctl.drift.handoffs import handoff_log, line_of
 from mastctl.drift.journal import NAME, Journal, JournalThread
 from mastctl.drift.pictures import FOLDER, Findings
-from mastctl.drift.samples import handoff_samples, pointing_sample, sample_of
+from mastctl.drift.samples import HANDOFF, handoff_samples, pointing_sample, sample_of
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ FILE = "pointings.jsonl"
 MOST_BYTES = 4 << 20
 """At which the file is written anew with what still counts; some 6000 samples."""
 SHOWN = 50
-"""Newest samples that are shown one by one."""
+"""Newest pointings that are shown one by one."""
 
 
 def sample_journal(folder: Path) -> Journal[MeasuredPointing]:
@@ -116,7 +116,7 @@ class DriftWatch:
         return self._together(self._residuals()[0])
 
     def report(self) -> CalibrationReport:
-        """Return the verdict with the figures of the samples, and the newest ones, the newest first."""
+        """Return the verdict with the figures of the samples, and the newest pointings, the newest first."""
         residuals, newest = self._residuals()
         counted: list[CountedPointing] = [
             {**one.sample, "sigma_px": one.sigma_px.tolist(), "chi_square": one.square}
@@ -203,7 +203,8 @@ class DriftWatch:
         assert windows is not None
         windows.forget(self._wall_s())
         verdict = verdict_of(windows.evidence(), len(windows.judged))
-        self._judged = windows.digest, verdict, tuple(windows.judged[-SHOWN:])
+        pointings = [one for one in windows.judged if one.sample["operation"] != HANDOFF]
+        self._judged = windows.digest, verdict, tuple(pointings[-SHOWN:])
 
     def _poll(self) -> None:
         self._findings.poll()

@@ -25,7 +25,7 @@ from mastctl.drift import watch as module
 from mastctl.drift.handoffs import read_log
 from mastctl.drift.journal import NAME, Journal, JournalThread
 from mastctl.drift.pictures import LOOKS, ReferencePicture, save_reference
-from mastctl.drift.samples import HANDOFF, pointing_sample, sample_of
+from mastctl.drift.samples import pointing_sample, sample_of
 from mastctl.drift.watch import FILE, DriftWatch, sample_journal
 
 STORED = stored_rig()
@@ -161,7 +161,7 @@ def test_hand_offs_are_logged_counted_and_speak_against_the_mast_file(
     watched.watch.handed_over(replace(made[0], mast_digest=OTHER.digest))
     watched.drifts()
     until(lambda: watched.watch.verdict()["pointings"] == 40, "both cameras of each count")
-    assert {one["operation"] for one in watched.watch.report()["newest"]} == {HANDOFF}
+    assert watched.watch.report()["newest"] == [], "they are no pointings"
     until(lambda: any("the calibration drifts: " in line for line in caplog.messages), "it is logged")
     watched.thread.close()
     (line,) = [line for line in caplog.messages if "the calibration drifts" in line]
