@@ -98,7 +98,7 @@ def find_plugged(ports: Sequence[str], machine: ExaminedMachine, say: Callable[[
     unused: list[str] = []
     named = [port if "://" in port else str(Path(port).absolute()) for port in ports]
     for port in named or serial_lines(machine):
-        say(f"asking {port}")
+        say(f"querying {port}")
         found, why = query_line(port, machine)
         if found is None:
             unused.append(why)
@@ -107,7 +107,7 @@ def find_plugged(ports: Sequence[str], machine: ExaminedMachine, say: Callable[[
         else:
             heads.append(found)
             unused += [sentence] if (sentence := missing_servo(found)[0]) else []
-    say("asking the cameras")
+    say("querying the cameras")
     cameras, no_cameras = query_cameras()
     for one in cameras[MOST_CAMERAS:]:
         unused.append(f"{one.summary}: a head has {MOST_CAMERAS} cameras at most here; {BY_HAND}")
