@@ -112,14 +112,11 @@ class CameraTrial:
     _delays_s: list[float] = field(default_factory=list)
     _problems: list[tuple[str, str]] = field(default_factory=list)
 
-    def frame(self, after_s: float | None = None) -> Frame:
-        """Take a frame exposed after a moment (from now on), and check that it can be true.
-
-        Raises DriverError, PromiseBroken, SubjectLost.
-        """
-        asked_s = time.monotonic() if after_s is None else after_s
-        answer = self._answer(asked_s, FRAME_TIMEOUT_S)
-        return frame_checks.checked(answer, self.name, self.size_px, asked_s, time.monotonic())
+    def frame(self) -> Frame:
+        """Take a frame exposed from now on. Raises DriverError, PromiseBroken, SubjectLost."""
+        after_s = time.monotonic()
+        answer = self._answer(after_s, FRAME_TIMEOUT_S)
+        return frame_checks.checked(answer, self.name, self.size_px, after_s, time.monotonic())
 
     @cached_property
     def summary(self) -> dict[str, Any]:

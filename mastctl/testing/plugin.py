@@ -25,15 +25,8 @@ DRIVERS = "mastctl.testing.drivers"
 USUAL_WIDTH_PX = 640
 AS_CONFIGURED = "as_configured"
 
-INI = {
-    "mastctl_config": "configuration of the simulated rover, a file relative to the root folder "
-    "(default: the packaged one)",
-    "mastctl_picture_width_px": f"width of every camera's pictures, pixels, or {AS_CONFIGURED} "
-    f"(default: {USUAL_WIDTH_PX})",
-    "mastctl_speed": "simulation.speed (default: max, or 1 where the head has a wire)",
-    "mastctl_seed": "simulation.seed (default: the configuration's)",
-    "mastctl_samples": "simulation.samples, rays a pixel each way (default: the configuration's, or 1)",
-}
+OPTIONS = ("config", "picture_width_px", "speed", "seed", "samples")
+"""Keywords of the marker that a project's configuration may have too, as ``mastctl_NAME``."""
 
 _LOG = pytest.StashKey[tuple[Path, int]]()
 """The daemons' log, and how much of it is of before."""
@@ -41,8 +34,9 @@ _LOG = pytest.StashKey[tuple[Path, int]]()
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Declare the options of a project's configuration."""
-    for name, meaning in INI.items():
-        parser.addini(name, meaning, type="string", default="")
+    for name in OPTIONS:
+        meaning = f"{name} of every test's simulated rover, as the marker {MARKER} has it"
+        parser.addini(f"{MARKER}_{name}", meaning, type="string", default="")
 
 
 def pytest_load_initial_conftests(early_config: pytest.Config, args: list[str]) -> None:
@@ -141,9 +135,9 @@ def fault(simulated_rover: SimulatedRover) -> Callable[..., SetFault]:
 def _options(request: pytest.FixtureRequest) -> dict[str, Any]:
     """The options of the marker and the project's configuration. Raises ValueError."""
     wanted: dict[str, Any] = {"config": None, "picture_width_px": USUAL_WIDTH_PX}
-    for name in INI:
-        if text := str(request.config.getini(name)).strip():
-            wanted[name.removeprefix("mastctl_")] = _value(text)
+    for name in OPTIONS:
+        if text := str(request.config.getini(f"{MARKER}_{name}")).strip():
+            wanted[name] = _value(text)
     for marker in reversed([*request.node.iter_markers(MARKER)]):  # the closest one last
         if marker.args:
             raise ValueError(f"the marker {MARKER} takes keywords only, found {marker.args[0]!r}")
