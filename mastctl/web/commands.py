@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from inspect import Parameter
 from typing import Annotated, Any, TypeVar, cast
@@ -45,6 +45,8 @@ class Parts:
     streams: Streams
     entrance: EntryRules
     feeds: CameraFeeds
+    requested: CommandRequest = field(default_factory=lambda: CommandRequest(Caller()))
+    """What the headers of a request for a command say, and when it came."""
 
 
 async def _parts(line: HTTPConnection) -> Parts:
@@ -73,7 +75,7 @@ def file_of(*kinds: str, **others: Any) -> dict[int | str, dict[str, Any]]:
     return {200: {"content": {kind: {"schema": form} for kind in kinds}, **others}}
 
 
-async def _requested(
+async def _commanded(
     request: Request,
     here: Here,
     mastctl_client: Annotated[str | None, Header(description="The client's name")] = None,
@@ -84,16 +86,13 @@ async def _requested(
     deadline_s: Annotated[
         DeadlineS | None, Header(description="How long the command is given, seconds")
     ] = None,
-) -> CommandRequest:
+) -> Parts:
     service = here.service
     now_s, last_stop = service.clock.now_s(), service.leases.last_stop
-    return CommandRequest(
+    requested = CommandRequest(
         caller_of(request), now_s, NOTHING, mastctl_lease, idempotency_key, deadline_s, last_stop
     )
-
-
-Requested = Annotated[CommandRequest, Depends(_requested)]
-"""What the headers of a request for a command say, and when it came."""
+    return replace(here, requested=requested)
 
 
 def command(
@@ -107,45 +106,37 @@ def command(
 ) -> Callable[[F], F]:
     """Add the route of a command, whose function carries it out, in a worker thread, once the entry lets it.
 
-    ``route`` is method and path below the prefix, ``POST /point``. The function takes the path, the query and
-    the body, and ``here`` and ``requested`` (`Requested`) if it needs them; its docstring is the route's
-    summary. ``usual_s``, of ``here`` and the function's parameters, is an operation's time without a
-    deadline; a ``deadline_s`` in the body counts as the header does, the shorter of both. ``beside``: it
-    stops something, so it runs in the stops' own threads, and each try is carried out.
+    ``route`` is method and path below the prefix, ``POST /point``. The function takes ``here``, with what is
+    ``requested``, and the path, the query and the body; its docstring is the route's summary. ``usual_s``, of
+    the function's parameters, is an operation's time without a deadline; a ``deadline_s`` in the body counts
+    as the header does, the shorter of both. ``beside``: it stops something, so it runs in the stops' own
+    threads, and each try is carried out.
     """
     method, _, path = route.partition(" ")
 
     def add(act: F) -> F:
         wanted, summary = inspect.signature(act, eval_str=True), (inspect.getdoc(act) or "").rstrip(".")
 
-        async def endpoint(
-            request: Request, here: Parts, requested: CommandRequest, **given: Any
-        ) -> Mapping[str, Any]:
-            own = {
-                name: one
-                for name, one in (("here", here), ("requested", requested))
-                if name in wanted.parameters
-            }
+        async def endpoint(request: Request, **given: Any) -> Mapping[str, Any]:
             request.scope["state"]["recorded"] = True  # whatever comes of it
+            here: Parts = given["here"]
             sent = _request_of(given)
-            allowed_s = None if usual_s is None else usual_s(here, **given)
-            deadlines_s = [one for one in (requested.deadline_s, sent.get("deadline_s")) if one is not None]
-            requested = replace(requested, request=sent, deadline_s=min(deadlines_s, default=None))
+            allowed_s = None if usual_s is None else usual_s(**given)
+            deadlines_s = [here.requested.deadline_s, sent.get("deadline_s")]
+            deadline_s = min((one for one in deadlines_s if one is not None), default=None)
+            requested = replace(here.requested, request=sent, deadline_s=deadline_s)
             if beside:
                 requested = replace(requested, key=None, deadline_s=None)
 
             def work() -> Mapping[str, Any]:
-                return here.service.entry.run(kind, requested, partial(act, **given, **own), allowed_s)
+                return here.service.entry.run(kind, requested, partial(act, **given), allowed_s)
 
             return await (stopped(here.service, work) if beside else here.waiting.run(work))
 
-        kinds = {"request": Request, "here": Here, "requested": Requested}
-        parameters = [Parameter(name, Parameter.KEYWORD_ONLY, annotation=one) for name, one in kinds.items()]
-        parameters += [
-            one.replace(kind=Parameter.KEYWORD_ONLY)
-            for name, one in wanted.parameters.items()
-            if name not in kinds
-        ]
+        own = {"request": Request, "here": Annotated[Parts, Depends(_commanded)]}
+        parameters = [Parameter(name, Parameter.KEYWORD_ONLY, annotation=one) for name, one in own.items()]
+        others = (one for name, one in wanted.parameters.items() if name not in own)
+        parameters += [one.replace(kind=Parameter.KEYWORD_ONLY) for one in others]
         endpoint.__signature__ = wanted.replace(parameters=parameters)  # type: ignore[attr-defined]
         endpoint.__annotations__ = {"return": wanted.return_annotation}
         endpoint.__name__ = act.__name__
@@ -192,6 +183,6 @@ def _request_of(given: Mapping[str, Any]) -> dict[str, Any]:
     for name, value in given.items():
         if isinstance(value, BaseModel):
             sent |= value.model_dump(exclude_none=True)
-        elif value is not None:
+        elif name != "here" and value is not None:
             sent[name] = value
     return sent

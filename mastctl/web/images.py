@@ -46,14 +46,9 @@ class CameraSettingsBody(StrictBody):
 
     @model_validator(mode="after")
     def _some(self) -> Self:
-        if not self.wanted:
+        if not self.model_dump(exclude_none=True):
             raise ValueError(f"one of {', '.join(type(self).model_fields)} at least is expected")
         return self
-
-    @property
-    def wanted(self) -> dict[str, float]:
-        """The changes, by name."""
-        return self.model_dump(exclude_none=True)
 
 
 class SnapshotQuery(StrictQuery):
@@ -120,7 +115,8 @@ def add_cameras(app: FastAPI) -> None:
     @command(app, "PATCH /cameras/{camera}/settings", Command("camera.settings", steers=True, need="idle"))
     def change(camera: str, body: CameraSettingsBody, here: Here) -> CameraSettingsAnswer:
         """Change some of a camera's settings, each with its automatic turned off."""
-        return _settings(here, camera, here.service.devices.change_settings(camera, body.wanted))
+        wanted = body.model_dump(exclude_none=True)
+        return _settings(here, camera, here.service.devices.change_settings(camera, wanted))
 
 
 def _settings(here: Parts, camera: str, notes: list[str]) -> CameraSettingsAnswer:

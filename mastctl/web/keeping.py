@@ -15,7 +15,7 @@ from mastctl.control.entry import Command
 from mastctl.http import PREFIX
 from mastctl.motion.requests import Angle, Name, StrictBody
 from mastctl.service.masts import MastInUse, Masts
-from mastctl.web.commands import Here, Requested, command, file_of
+from mastctl.web.commands import Here, command, file_of
 
 REPORT = (
     "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox; base-uri 'none'; "
@@ -170,10 +170,10 @@ def add_bench(app: FastAPI) -> None:
         return await here.waiting.run(here.service.bench.answer)
 
     @command(app, "POST /bench", Command("bench", steers=True, need="track"), status_code=202)
-    def begin(body: BenchBody, here: Here, requested: Requested) -> answers.BenchAnswer:
+    def begin(body: BenchBody, here: Here) -> answers.BenchAnswer:
         """Begin a bench calibration, or go on with one."""
         bench = here.service.bench
-        return {"run": bench.start(requested.caller.name, requested.last_stop, **body.model_dump())}
+        return {"run": bench.start(here.requested.caller.name, here.requested.last_stop, **body.model_dump())}
 
     @command(app, "POST /bench/stands", Command("bench.stands"))
     def stands(here: Here) -> answers.BenchAnswer:
@@ -181,9 +181,9 @@ def add_bench(app: FastAPI) -> None:
         return {"run": here.service.bench.stands()}
 
     @command(app, "POST /bench/leave", Command("bench.leave"), beside=True)
-    def leave(here: Here, requested: Requested) -> answers.BenchAnswer:
+    def leave(here: Here) -> answers.BenchAnswer:
         """End the bench calibration; it can go on later."""
-        return {"run": here.service.bench.leave(requested.caller.name)}
+        return {"run": here.service.bench.leave(here.requested.caller.name)}
 
     @command(app, "DELETE /bench/runs/{name}", Command("bench.forget"))
     def forget(name: RunName, here: Here) -> answers.BenchRuns:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import math
 import threading
 from functools import partial
@@ -15,8 +14,8 @@ from pydantic import BaseModel, Field, StringConstraints, model_validator
 
 from calib.geometry.rigid import Rigid, rotation_of
 from mastctl import answers
-from mastctl.control.entry import ESTOP, STOP, Command, CommandRequest
-from mastctl.control.lease import LONGEST_S, SHORTEST_S, USUAL_S, Lease, LeaseTable, client_name
+from mastctl.control.entry import ESTOP, STOP, Command
+from mastctl.control.lease import LONGEST_S, SHORTEST_S, USUAL_S, Lease, client_name
 from mastctl.devices.judge import LEAST_CONE_RAD, WIDEST_CONE_RAD, SunDirection, direction_of
 from mastctl.errors import BadRequest, NotNow, Unable, one_line
 from mastctl.http import PREFIX
@@ -36,10 +35,9 @@ from mastctl.safety.latch import LONGEST
 from mastctl.service.service import Service
 from mastctl.service.steering import usual_s
 from mastctl.service.stopping import StopsHang
-from mastctl.web.commands import Here, Parts, Requested, command, stop_first
+from mastctl.web.commands import Here, Parts, command, stop_first
 
 BODY_S = 0.02  # how long an emergency stop waits for a reason that did not come with its request
-LARGEST_BODY_BYTES = 4096
 
 Person = Annotated[str, StringConstraints(strip_whitespace=True, min_length=1, max_length=LONGEST)]
 Sigma = Annotated[float, Field(ge=0.0, le=LARGEST_M)]
@@ -250,15 +248,10 @@ def add_estop(app: FastAPI) -> None:
 async def _reason_and_name(request: Request) -> dict[str, str | None]:
     """The reason and the name in a body, None where it has none, or does not come in time."""
     given: dict[str, str | None] = {"reason": None, "name": None}
-    data = b""
     try:
         async with asyncio.timeout(BODY_S):
-            async for part in request.stream():
-                data += part
-                if len(data) > LARGEST_BODY_BYTES:
-                    return given
-        found = json.loads(data)
-    except Exception:  # late, broken off, no JSON: a stop is not refused for its body
+            found = await request.json()
+    except Exception:  # late, too long, broken off, no JSON: a stop is not refused for its body
         return given
     for key in given if isinstance(found, dict) else ():
         if isinstance(found.get(key), str):
@@ -273,9 +266,9 @@ def add_tracking(app: FastAPI) -> None:
         return usual_s(here.service.config.limits, 1)
 
     @command(app, "POST /pose", Command("pose"), usual_s=one_look_s)
-    def pose(body: PoseBody, here: Here, requested: Requested) -> answers.PoseTaken:
+    def pose(body: PoseBody, here: Here) -> answers.PoseTaken:
         """Say where the rover stands; a track is carried over and looked for."""
-        operation = here.service.steering.take_pose(body.pose(requested.came_s), body.look)
+        operation = here.service.steering.take_pose(body.pose(here.requested.came_s), body.look)
         stop_before_keep_outs(here.service)  # a sun of the site frame turns with the rover
         return {"operation": operation, "track": here.service.track_answer()}
 
@@ -321,10 +314,10 @@ def add_limits(app: FastAPI) -> None:
         return here.service.devices.judge.sun_as_json()
 
     @command(app, "POST /limits/sun", Command("limits.sun"))
-    def tell(body: SunBody, here: Here, requested: Requested) -> answers.SunAnswer:
+    def tell(body: SunBody, here: Here) -> answers.SunAnswer:
         """Say where the sun stands; the head keeps off it."""
         judge = here.service.devices.judge
-        judge.use_sun(body.sun(requested.came_s))
+        judge.use_sun(body.sun(here.requested.came_s))
         stop_before_keep_outs(here.service)
         return judge.sun_as_json()
 
@@ -351,44 +344,45 @@ def add_lease(app: FastAPI) -> None:
         return {"control": here.service.leases.control()}
 
     @command(app, "POST /lease", Command("lease", grants=True))
-    def acquire(body: LeaseBody, here: Here, requested: Requested) -> answers.LeaseGranted:
+    def acquire(body: LeaseBody, here: Here) -> answers.LeaseGranted:
         """Acquire the lease, if no other client steers."""
-        leases = here.service.leases
-        return _granted(leases, leases.acquire(requested.caller, **_terms(body, requested)))
+        leases, caller = here.service.leases, here.requested.caller
+        return _granted(here, leases.acquire(caller, **_terms(body, here)))
 
     @command(app, "POST /lease/renew", Command("lease.renew", grants=True))
-    def renew(here: Here, requested: Requested, body: RenewBody | None = None) -> answers.LeaseGranted:
+    def renew(here: Here, body: RenewBody | None = None) -> answers.LeaseGranted:
         """Have the lease run for its time from now on."""
-        leases = here.service.leases
-        return _granted(leases, leases.renew(_lease_of(requested), None if body is None else body.for_s))
+        return _granted(
+            here, here.service.leases.renew(_lease_of(here), None if body is None else body.for_s)
+        )
 
     @command(app, "DELETE /lease", Command("lease.release"))
-    def release(here: Here, requested: Requested) -> answers.LeaseAnswer:
+    def release(here: Here) -> answers.LeaseAnswer:
         """Release the lease."""
         leases = here.service.leases
-        leases.release(_lease_of(requested))
+        leases.release(_lease_of(here))
         return {"control": leases.control()}
 
     @command(app, "POST /lease/take", Command("lease.take", grants=True))
-    def take(body: TakeBody, here: Here, requested: Requested) -> answers.LeaseGranted:
+    def take(body: TakeBody, here: Here) -> answers.LeaseGranted:
         """Take the lease from its holder; what runs under it is stopped."""
-        leases = here.service.leases
-        return _granted(leases, leases.take(requested.caller, body.reason, **_terms(body, requested)))
+        leases, caller = here.service.leases, here.requested.caller
+        return _granted(here, leases.take(caller, body.reason, **_terms(body, here)))
 
 
-def _terms(body: LeaseBody, requested: CommandRequest) -> dict[str, Any]:
+def _terms(body: LeaseBody, here: Parts) -> dict[str, Any]:
     """What a lease is granted with, by the names of `LeaseTable.acquire`."""
     name = None if body.name is None else client_name(body.name)
-    last_stop = requested.last_stop if body.ends_with_stop else None
+    last_stop = here.requested.last_stop if body.ends_with_stop else None
     return {"name": name, "for_s": body.for_s, "last_stop": last_stop}
 
 
-def _granted(leases: LeaseTable, lease: Lease) -> answers.LeaseGranted:
-    return {"lease_id": lease.id, **leases.lease_as_json(lease)}
+def _granted(here: Parts, lease: Lease) -> answers.LeaseGranted:
+    return {"lease_id": lease.id, **here.service.leases.lease_as_json(lease)}
 
 
-def _lease_of(requested: CommandRequest) -> str:
+def _lease_of(here: Parts) -> str:
     """The lease that a request speaks of. Raises BadRequest."""
-    if requested.lease is None:
+    if here.requested.lease is None:
         raise BadRequest("bad_request", "Mastctl-Lease is missing; the id of the lease is expected")
-    return requested.lease
+    return here.requested.lease
