@@ -112,7 +112,7 @@ def _refine(args: argparse.Namespace) -> Answer:
     check_file(args.out, "--out")
     mast = load_rig(args.survey)
     for note in mast.notes:
-        output.tell(note)
+        output.show_line(note)
     document, found = refine(mast, [read_log(path) for path in args.refine])
     shown: list[str | Shown] = [
         *tables_at(document, REFINED),
@@ -150,7 +150,7 @@ def _from_survey(args: argparse.Namespace) -> Answer:
         checked_survey(survey, method)
     except SurveyRefused as refusal:
         for finding in refusal.findings[1:]:
-            output.tell(str(finding))  # the first comes last, as the reason
+            output.show_line(str(finding))  # the first comes last, as the reason
         raise
     check_file(args.out, "--out")  # before the minutes of the search, not after them
     if args.out.is_file() and args.out.resolve().is_relative_to(survey.folder.resolve()):
@@ -170,7 +170,7 @@ def _from_survey(args: argparse.Namespace) -> Answer:
         *(f"no dots in image {name}: {reason}" for name, reason in undetected),
         *map(sentence_of, warnings),
     ):
-        output.tell(f"warning: {sentence}")
+        output.show_line(f"warning: {sentence}")
     with output.waiting(args.json, f"fitting {len(survey.images)} images ({method})"):
         former = None if in_use is None else in_use.rig
         done = calibrate(survey, args.out, method, args.mast or 6, warnings, undetected, args.report, former)
@@ -200,7 +200,7 @@ def _in_use(args: argparse.Namespace) -> StoredRig | None:
     try:
         return load_rig(args.out) if args.out.exists() else None
     except BadFile as error:
-        output.tell(f"warning: nothing to compare with: {error}")
+        output.show_line(f"warning: nothing to compare with: {error}")
         return None
 
 
@@ -397,17 +397,17 @@ def _watched(client: Client) -> BenchRunRecord:
         both = min(len(sentences), len(run["sentences"]))
         known = max(n for n in range(both + 1) if sentences[len(sentences) - n :] == run["sentences"][:n])
         for sentence in run["sentences"][known:]:
-            output.tell(sentence)
+            output.show_line(sentence)
         sentences = run["sentences"]
         if run["step"] == "over":
             return run
         requested = run["requested"]
         if requested is not None and requested["name"] != placement:
             placement = requested["name"]
-            output.tell(f"placement {placement}: the board {requested['description']}")
+            output.show_line(f"placement {placement}: the board {requested['description']}")
         if run["step"] == "pictures" and run["pictures"] > pictures:
             pictures = run["pictures"]
-            output.tell(_progress(run))
+            output.show_line(_progress(run))
         if run["state"] == "waiting":
             if not signals.may_read_stdin():
                 raise CommandError(

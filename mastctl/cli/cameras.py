@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli.options import command, option
-from mastctl.cli.output import Answer, Shown, WrongUse, check_file, tables_at, tell
+from mastctl.cli.output import Answer, Shown, WrongUse, check_file, show_line, tables_at
 
 if TYPE_CHECKING:
     from drivers.hardware import HardwareSettings
@@ -173,7 +173,7 @@ def camera_sync(args: argparse.Namespace) -> Answer:
     with opened as (devices, cameras):
         sweep = Sweep(devices, cameras, rig, config.limits, clock)
         if not args.json:
-            tell(
+            show_line(
                 f"turning pan {plan.amplitude_rad:.3f} rad to either side for {plan.seconds:g} s, "
                 f"at {plan.speed_rad_per_s:.3f} rad/s at most; Ctrl-C stops the head"
             )

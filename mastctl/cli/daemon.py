@@ -82,7 +82,7 @@ def client_of(
             if not default_address:
                 raise
             listen = Listen()
-            output.tell(f"{error}; using the default address {listen.url}")
+            output.show_line(f"{error}; using the default address {listen.url}")
         if listen.socket is None and listen.port == 0:
             raise WrongUse("the configuration listens at any free port (0); give --url")
         url = listen.url
@@ -100,13 +100,13 @@ def followed(client: Client, operation_id: str, as_json: bool, timeout_s: float)
 
     def show(step: Step) -> None:
         mark = "✓" if step["state"] == "done" else "✗"
-        output.tell(f"{mark} {step['name']} ({step['duration_s']:.2f} s)")
+        output.show_line(f"{mark} {step['name']} ({step['duration_s']:.2f} s)")
 
     try:
         return client.wait(operation_id, timeout_s, None if as_json else show)
     except KeyboardInterrupt:
         if not as_json:
-            output.tell(f"operation {operation_id} goes on; 'mastctl stop' stops it")
+            output.show_line(f"operation {operation_id} goes on; 'mastctl stop' stops it")
         raise
 
 

@@ -117,7 +117,7 @@ def _demo(args: argparse.Namespace) -> Answer:
         rig = daemon.service.stored.rig
         camera = head_pair(rig, set(config.hardware.cameras))[0]
         behind = f" behind {args.wire} bytes" if args.wire else ""
-        output.tell(f"simulated rover at {daemon.url}, head {rover.settings.head.name}{behind}")
+        output.show_line(f"simulated rover at {daemon.url}, head {rover.settings.head.name}{behind}")
         return _run(args, client, simulation_truth(rover), (head_note(rover, rig, camera),))
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli.options import command, option, positive_number
-from mastctl.cli.output import Answer, CommandError, WrongUse, check_file, tables_at, tell
+from mastctl.cli.output import Answer, CommandError, WrongUse, check_file, show_line, tables_at
 
 if TYPE_CHECKING:
     import numpy as np
@@ -143,14 +143,14 @@ def read_mast_file(path: Path) -> StoredRig:
     from calib.files.mast_file import load_rig
 
     stored = load_rig(path)
-    tell_notes(stored.notes)
+    show_notes(stored.notes)
     return stored
 
 
-def tell_notes(notes: Iterable[str]) -> None:
+def show_notes(notes: Iterable[str]) -> None:
     """Write on stderr what reading a file changed."""
     for note in notes:
-        tell(note)
+        show_line(note)
 
 
 def named(name: str | None, known: Collection[str], where: Path | None, kind: str = "camera") -> str:
@@ -249,7 +249,7 @@ def _report_empty(path: Path, valid: np.ndarray, what: str) -> None:
     if rows:
         more = f" and {len(rows) - MOST_ROWS} more" if rows[MOST_ROWS:] else ""
         where = f"{', '.join(rows[:MOST_ROWS])}{more}"
-        tell(f"{path}: {what} in row {where}: behind the camera, beyond its reach, or not finite")
+        show_line(f"{path}: {what} in row {where}: behind the camera, beyond its reach, or not finite")
 
 
 @command(
@@ -303,11 +303,11 @@ def _chosen_model(args: argparse.Namespace) -> CameraModel:
     source = load_any(args.file)
     if not isinstance(source, StoredRig):
         _, camera = camera_of(source, args.camera)
-        tell_notes(camera.notes)
+        show_notes(camera.notes)
         if args.pan is not None or args.tilt is not None:
             raise WrongUse(f"{args.file} has no mast; leave --pan and --tilt out")
         return camera.model
-    tell_notes(source.notes)
+    show_notes(source.notes)
     name = named(args.camera, source.rig.cameras, source.path)
     need_joints(source.rig, name, args)
     return source.rig.camera_in_rover(name, args.pan or 0.0, args.tilt or 0.0)
@@ -339,7 +339,7 @@ def camera_maps(args: argparse.Namespace) -> Answer:
     arrays: dict[str, np.ndarray] = {}
     if args.pair is None:
         name, camera = camera_of(load_any(args.file), args.camera)
-        tell_notes(camera.notes)
+        show_notes(camera.notes)
         new = ideal_camera(camera.model, args.focal_px)
         frame, made = camera.frame, [("", name, new, maps_between(new, camera.model))]
     else:
@@ -404,7 +404,7 @@ def camera_mode(args: argparse.Namespace) -> Answer:
     before = before if isinstance(before, list) else [] if before is None else [before]
     noted = [*before, {"camera": name, "of": stored.digest, "mode": str(mode)}]
     if stored.rig.cameras[name].sensor_mode is not None and rig.cameras[name].sensor_mode is None:
-        tell(f"which part of the sensor {name} then shows is not known: its sensor_mode is left out")
+        show_line(f"which part of the sensor {name} then shows is not known: its sensor_mode is left out")
     written = save_rig(replace(rig, provenance={**rig.provenance, "modes": noted}), args.out)
     document = {"out": str(args.out), "camera": name, "size_px": list(size_px), "mode": str(mode)}
     return Answer(

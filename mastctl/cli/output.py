@@ -172,7 +172,7 @@ def _print_table(shown: Shown) -> None:
         console.print(Text(note))
 
 
-def tell(message: str) -> None:
+def show_line(message: str) -> None:
     """Write one line for people to stderr."""
     sys.stderr.write(one_line(message) + "\n")
 

@@ -59,9 +59,9 @@ def _new(args: argparse.Namespace) -> Answer:
 
     check_folder(args.folder, "FOLDER")
     check_free(args.folder, RIG_FILES)
-    found = find_plugged(args.port, ExaminedMachine(), output.tell)
+    found = find_plugged(args.port, ExaminedMachine(), output.show_line)
     for line in (*(f"found {one}" for one in found.summaries), *found.unused):
-        output.tell(line)
+        output.show_line(line)
     if len(found.heads) > 1:
         ports = " and ".join(one.port for one in found.heads)
         raise CommandError("two_heads", f"heads answer at {ports}; --port names the one of this rig")
@@ -75,12 +75,12 @@ def _new(args: argparse.Namespace) -> Answer:
     )  # fmt: skip
     simulated = head is None and not found.cameras
     if simulated:
-        output.tell(TWIN)
+        output.show_line(TWIN)
         made = write_simulated(args.folder, found, numbers)
     else:
         made = write_rig(args.folder, found, head, numbers)
     for note in made.notes:
-        output.tell(note)
+        output.show_line(note)
     document = {
         "heads": [one.summary for one in found.heads],
         "cameras": [one.summary for one in found.cameras],

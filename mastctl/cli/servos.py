@@ -158,7 +158,7 @@ def _home(args: argparse.Namespace) -> Answer:
             "clear the mast, then give --sweep-full-range"
         )
     bench = _unit_bench()
-    output.tell("homing: both axes sweep their full range, up to half a minute")
+    output.show_line("homing: both axes sweep their full range, up to half a minute")
     with line_locked(args.port):
         return _unit(bench.home(args.port, args.baud or bench.bauds[0]))
 

@@ -78,21 +78,14 @@ def _point(args: argparse.Namespace) -> Answer:
 
 
 def _check_target(args: argparse.Namespace) -> None:
-    """Refuse options that do not go together, before any daemon gets a request. Raises WrongUse."""
+    """Refuse what no request can say; the daemon refuses all else that does not go together."""
     if (args.camera is None) != (args.at is None):
         raise WrongUse("--camera and --at go together")
     panorama = getattr(args, "panorama", None) is not None
-    if (args.pixel is not None and len(args.pixel) != (2 if panorama else 4)) or (
-        panorama and args.pixel is None
-    ):
+    if len(args.pixel or ()) != (2 if panorama else 4 if args.pixel else 0):
         raise WrongUse("--pixel CAMERA FRAME_ID X Y is expected, or --panorama FOLDER --pixel X Y")
     if not panorama and (getattr(args, "recompute", False) or getattr(args, "by_direction", False)):
         raise WrongUse("--recompute and --by-direction go with --panorama")
-    if args.frame is not None and args.position is None:
-        raise WrongUse("--frame goes with --position")
-    far = any(getattr(args, name, None) is not None for name in ("range", "ground", "plane"))
-    if far and (panorama or (args.pixel is None and args.camera is None)):
-        raise WrongUse("--range, --ground and --plane go with --pixel or --camera")
     if getattr(args, "seconds", None) is not None and args.rates is None:
         raise WrongUse("--seconds goes with --rates")
 
@@ -109,13 +102,14 @@ def _target(args: argparse.Namespace, client: Client) -> dict[str, Any]:
         x, y = seen.pixel_px.tolist()
         target = {"id": folder.index.id, "view": seen.view, "x_px": x, "y_px": y}
         given = {name: True for name in ("recompute", "by_direction") if getattr(args, name)}
-        return {"panorama": target | given}
+        return {"panorama": target | given, "frame": args.frame}
+    pixel = None
     if args.pixel is not None:
-        camera, frame_id, *pixel = args.pixel
-        return {"pixel": (camera, frame_id, *_pixel("--pixel", pixel))}
-    if args.camera is not None:
-        return {"pixel": (args.camera, client.snapshot(args.camera).frame_id, *args.at)}
-    return {} if args.position is None else {"position_m": args.position, "frame": args.frame}
+        camera, frame_id, *numbers = args.pixel
+        pixel = (camera, frame_id, *_pixel("--pixel", numbers))
+    elif args.camera is not None:
+        pixel = (args.camera, client.snapshot(args.camera).frame_id, *args.at)
+    return {"pixel": pixel, "position_m": args.position, "frame": args.frame}
 
 
 def _pixel(option: str, texts: list[str]) -> list[float]:
