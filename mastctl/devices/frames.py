@@ -109,32 +109,28 @@ def checked(
     try:
         image = answer.image  # type: ignore[attr-defined]
         sequence = _whole(answer.sequence)  # type: ignore[attr-defined]
-        mid_s = number(answer.mid_exposure_s)  # type: ignore[attr-defined]
-        exposure_s = number(answer.exposure_s)  # type: ignore[attr-defined]
+        mid_s = number(answer.mid_exposure_s, "mid_exposure_s")  # type: ignore[attr-defined]
+        exposure_s = number(answer.exposure_s, "exposure_s")  # type: ignore[attr-defined]
+        began_s, ended_s = mid_s - exposure_s / 2, mid_s + exposure_s / 2
+        if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+            kind = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
+            raise TypeError(f"the image is {kind} where an array of uint8 is expected")
+        if not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)) or image.size == 0:
+            raise ValueError(f"the image has shape {image.shape} where (h, w) or (h, w, 3) is expected")
+        if sequence < 0 or exposure_s < 0.0:
+            raise ValueError(f"sequence {sequence} and exposure {exposure_s} s where neither may be below 0")
+        if ended_s > now_s + CLOCK_TOLERANCE_S:
+            raise ValueError(f"the exposure is stamped to end {ended_s - now_s:.3f} s in the future")
     except (AttributeError, TypeError, ValueError) as reason:
         message = f"next_frame returned {type(answer).__name__} that is not a frame: {reason}"
         raise BadFrame(message, device=camera) from None
-    if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
-        kind = image.dtype if isinstance(image, np.ndarray) else type(image).__name__
-        raise BadFrame(f"the image is {kind} where an array of uint8 is expected", device=camera)
-    if not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)) or image.size == 0:
-        message = f"the image has shape {image.shape} where (h, w) or (h, w, 3) is expected"
-        raise BadFrame(message, device=camera)
     if size_px is not None:
         check_size(camera, (image.shape[1], image.shape[0]), size_px)
-    if sequence < 0 or exposure_s < 0.0:
-        message = f"sequence {sequence} and exposure {exposure_s} s where neither may be below 0"
-        raise BadFrame(message, device=camera)
-    ended_s = mid_s + exposure_s / 2
-    if ended_s > now_s + CLOCK_TOLERANCE_S:
-        message = f"the exposure is stamped to end {ended_s - now_s:.3f} s in the future"
-        raise BadFrame(message, device=camera)
-    began_s = mid_s - exposure_s / 2
     if began_s <= exposed_after_s:
-        message = (
+        early = (
             f"the frame that came was exposed {exposed_after_s - began_s:.3f} s before the requested moment"
         )
-        raise NoFreshFrame(message, device=camera)
+        raise NoFreshFrame(early, device=camera)
     darkest, brightest = np.percentile(image[::8, ::8], (1, 99))
     if brightest < DARK_GREY:
         message = f"the picture is dark: its brightest hundredth is at {brightest:.0f} of 255"
@@ -366,16 +362,16 @@ def _settings(answer: object) -> dict[str, float | None]:
     return known
 
 
-def number(value: object) -> float:
-    """Return a finite float, refusing what only looks like one."""
+def number(value: object, name: str = "it") -> float:
+    """Return a finite float, refusing what only looks like one by its name. Raises TypeError, ValueError."""
     if isinstance(value, bool) or not isinstance(value, (int, float, np.integer, np.floating)):
-        raise TypeError(f"{type(value).__name__} where a number is expected")
+        raise TypeError(f"{name} is {type(value).__name__} where a number is expected")
     try:
         number = float(value)
     except OverflowError:  # an integer
-        raise ValueError("a number beyond any float where a finite one is expected") from None
+        raise ValueError(f"{name} is beyond any float where a finite number is expected") from None
     if not np.isfinite(number):
-        raise ValueError(f"{number} where a finite number is expected")
+        raise ValueError(f"{name} is {number} where a finite number is expected")
     return number
 
 

@@ -11,7 +11,7 @@ import bisect
 import math
 import threading
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import islice, pairwise, takewhile
 
@@ -59,41 +59,29 @@ def checked(answer: object, device: str, now_s: float, newest_s: float | None) -
     an angle is not finite or beyond a full turn, or the stamp lies in the future, more than 1 s back, or
     before the last one.
     """
-    numbers = {}
-    for name in ("pan_rad", "tilt_rad", "time_s"):
-        try:
-            numbers[name] = number(getattr(answer, name, None))
-        except (TypeError, ValueError) as reason:
-            found = f"read returned {type(answer).__name__} whose {name} is {reason}"
-            raise BadReply(found, device=device) from None
-    moving = getattr(answer, "moving", None)
-    if not isinstance(moving, (bool, np.bool_)):
-        raise BadReply(f"moving is {str(moving)[:40]} where true or false is expected", device=device)
-    for name in ("pan_rad", "tilt_rad"):
-        if abs(numbers[name]) > math.tau:
-            raise BadReply(
-                f"{name} {numbers[name]:.6g} rad is beyond a full turn (6.28319 rad)", device=device
-            )
-    time_s = numbers["time_s"]
-    if time_s > now_s + CLOCK_TOLERANCE_S:
-        raise BadReply(f"the reading is stamped {time_s - now_s:.3f} s in the future", device=device)
-    if time_s < now_s - OLDEST_READING_S:
-        raise BadReply(
-            f"the reading is {now_s - time_s:.3f} s old, at most {OLDEST_READING_S} s is taken", device=device
+    try:
+        pan_rad, tilt_rad, time_s = (
+            number(getattr(answer, name, None), name) for name in ("pan_rad", "tilt_rad", "time_s")
         )
-    if newest_s is not None and time_s < newest_s:
-        raise BadReply(f"the reading's time goes back by {newest_s - time_s:.3f} s", device=device)
-    faults = _faults(getattr(answer, "faults", ()) or (), device)
-    return Reading(numbers["pan_rad"], numbers["tilt_rad"], bool(moving), time_s, faults)
-
-
-def _faults(given: object, device: str) -> tuple[str, ...]:
-    """What the head reports of itself, each as one line, `MOST_FAULTS` at most. Raises BadReply."""
-    if isinstance(given, str):
-        given = (given,)
-    if not isinstance(given, Iterable):
-        raise BadReply(f"faults is {one_line(given, 40)} where sentences are expected", device=device)
-    return tuple(one_line(fault, LONGEST_FAULT) for fault in islice(given, MOST_FAULTS))
+        moving, faults = getattr(answer, "moving", None), getattr(answer, "faults", ()) or ()
+        if not isinstance(moving, (bool, np.bool_)):
+            raise TypeError(f"moving is {str(moving)[:40]} where true or false is expected")
+        if max(abs(pan_rad), abs(tilt_rad)) > math.tau:
+            raise ValueError(
+                f"pan_rad {pan_rad:.6g}, tilt_rad {tilt_rad:.6g} is beyond a full turn (6.28319)"
+            )
+        if time_s > now_s + CLOCK_TOLERANCE_S:
+            raise ValueError(f"it is stamped {time_s - now_s:.3f} s in the future")
+        if time_s < now_s - OLDEST_READING_S:
+            raise ValueError(f"it is {now_s - time_s:.3f} s old, at most {OLDEST_READING_S} s is allowed")
+        if newest_s is not None and time_s < newest_s:
+            raise ValueError(f"its time goes back by {newest_s - time_s:.3f} s")
+        sentences = (faults,) if isinstance(faults, str) else islice(faults, MOST_FAULTS)
+        reported = tuple(one_line(fault, LONGEST_FAULT) for fault in sentences)
+    except (TypeError, ValueError) as reason:
+        found = f"read returned {type(answer).__name__} that is no reading: {reason}"
+        raise BadReply(found, device=device) from None
+    return Reading(pan_rad, tilt_rad, bool(moving), time_s, reported)
 
 
 class JointHistory:
