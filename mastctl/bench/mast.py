@@ -189,7 +189,7 @@ class DaemonMast:
         )
         axes, limits = status["axes"], status["limits"]
         pan_rad, tilt_rad = (
-            (float(limits[key][0]), float(limits[key][1])) for key in ("pan_rad", "tilt_rad")
+            (float(one[0]), float(one[1])) for one in (limits["pan_rad"], limits["tilt_rad"])
         )
         one_sided = bool(axes) and all(axis["one_sided"] for axis in axes.values())
         count_rad = max((float(axis["count_rad"] or 0.0) for axis in axes.values()), default=0.0)

@@ -35,23 +35,22 @@ CORNER_PX = 0.1
 """What a corner's sigma is said to be beforehand."""
 
 
-def open_survey(path: Path, board: AnyBoard, head: BenchHead, corner_px: float = CORNER_PX) -> BenchFolder:
+def open_survey(
+    path: Path, board: AnyBoard, head: BenchHead, corner_px: float = CORNER_PX, mast_file: bytes = b""
+) -> BenchFolder:
     """Return the folder of a new run, or of one with the same board, sigmas and cameras, which goes on.
 
-    Raises BadFile if the folder holds something else.
+    A new one keeps the ``mast_file`` in use. Raises BadFile if the folder holds something else.
     """
     sigma = Sigma(0.0, 0.0, joint_rad=head.count_rad / 12**0.5, corner_px=corner_px)
-    return BenchFolder(path, {BOARD: board}, sigma, survey_cameras(head.rig), head.rig.stereo)
-
-
-def keep_former(folder: Path, mast_file: bytes) -> None:
-    """Keep the mast file in use, unless one is kept already. Raises NotWritten."""
-    path = folder / FORMER
+    folder = BenchFolder(path, {BOARD: board}, sigma, survey_cameras(head.rig), head.rig.stereo)
+    former = path / FORMER
     try:
-        if not path.exists():
-            replace_bytes(path, mast_file, 0o644)
+        if mast_file and not former.exists():
+            replace_bytes(former, mast_file, 0o644)
     except OSError as error:
-        raise NotWritten(path, "", f"cannot be written: {error.strerror or error}") from None
+        raise NotWritten(former, "", f"cannot be written: {error.strerror or error}") from None
+    return folder
 
 
 def former_rig(folder: Path) -> Rig | None:

@@ -29,7 +29,7 @@ from mastctl.bench.known import BenchKnowledge
 from mastctl.bench.mast import DaemonMast, SimulatedBoard
 from mastctl.bench.run import BenchRun, Checked
 from mastctl.bench.runs import HOLDER, BenchJob
-from mastctl.bench.survey import fit_in_frame, keep_former, open_survey
+from mastctl.bench.survey import fit_in_frame, open_survey
 from mastctl.calibration.landing import expected_pointing
 from mastctl.calibration.run import checked_survey, conclude, mast_document, picked, with_fit
 from mastctl.calibration.verdict import judge
@@ -57,8 +57,7 @@ def work(job: BenchJob, link: Connection) -> None:
             board = load_board(job.folder.board)
             reporter.change(board_m=list(board.size_m))
             mast = DaemonMast(client, list(client.status()["cameras"]), board)
-            folder = open_survey(job.folder.seen, board, mast.head)
-            keep_former(folder.path, client.mast_file())
+            folder = open_survey(job.folder.seen, board, mast.head, mast_file=client.mast_file())
             known = BenchKnowledge(mast.head, folder, board, reporter.say)
             simulated = SimulatedBoard(client, board, mast.head.rig) if job.run["simulated"] else None
             run = BenchRun(mast, known, reporter, job.run["wanted_px"], job.run["most"], simulated)

@@ -184,24 +184,16 @@ def compared_models(survey: Survey) -> dict[str, Any]:
             continue
         best = earned(scores, fitted)
         off_px = {one.kind: f"{one.left_out_px:.3f}" for one in scores}
-        if best.kind == fitted:
+        sentence = f"{fitted} is right: no other model predicts left-out pictures better than chance explains"
+        if best.kind != fitted:
             sentence = (
-                f"{fitted} is right: no other model predicts left-out pictures better than chance explains"
-            )
-        else:
-            before = f"{off_px[fitted]} px" if fitted in off_px else "no prediction"
-            sentence = (
-                f"{best.kind} predicts left-out pictures to {off_px[best.kind]} px, {fitted} to {before}: "
-                f"fit again with --model {best.kind.lower()}"
+                f"{best.kind} predicts left-out pictures best: fit again with --model {best.kind.lower()}"
             )
         found[name] = {
             "fitted": fitted,
             "proposed": best.kind,
             "sentence": f"{sentence} (px: {', '.join(map(' '.join, off_px.items()))})",
-            "models": [
-                {"model": one.kind, "parameters": one.parameters, "left_out_px": one.left_out_px}
-                for one in scores
-            ],
+            "models": [{"model": one.kind, **picked(one, "parameters", "left_out_px")} for one in scores],
         }
     return found
 

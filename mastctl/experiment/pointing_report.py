@@ -122,19 +122,18 @@ def _targets(records: Sequence[TargetRecord]) -> Table:
     """Every target for people."""
     headings = (
         "distance", "target", "range m", "clicked x, y", "first x, y ± sigma", "second x, y ± sigma", "s",
+        "failed",
     )  # fmt: skip
-    failed = any(record.error for record in records)
     rows = []
     for record in records:
         landings = [
             f"{one.residual_px[0]:+.2f}, {one.residual_px[1]:+.2f} ± {max(one.sigma_px):.2f}"
             for one in record.landings
         ]
-        start = [f"{record.distance_m:g} m", str(record.index), number(record.range_m)]
         clicked = "" if math.isnan(record.clicked_px[0]) else x_y(record.clicked_px, 0)
-        cells = [*start, clicked, *[*landings, "", ""][:2], f"{record.seconds:.1f}"]
-        rows.append([*cells, record.error] if failed else cells)
-    return Table((*headings, "reason") if failed else headings, rows)
+        start = [f"{record.distance_m:g} m", str(record.index), number(record.range_m), clicked]
+        rows.append([*start, *[*landings, "", ""][:2], f"{record.seconds:.1f}", record.error])
+    return Table(headings, rows)
 
 
 def _scatter(experiment: PointingExperiment) -> Figure:
