@@ -109,7 +109,7 @@ class JournalThread:
         self._file_time = file_time or SystemClock()
         self._queue: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._polled: list[Callable[[], None]] = []
-        self._busy_since_s: tuple[float, float] | None = None
+        self._busy_since_s: float | None = None
         self._thread = threading.Thread(target=self._work, name=NAME, daemon=True)
         self._thread.start()
 
@@ -124,11 +124,12 @@ class JournalThread:
 
     def faults(self) -> tuple[StandingFault, ...]:
         """Return what is wrong with the files: one does not answer."""
-        busy = self._busy_since_s
-        if busy is None or self._file_time.now_s() - busy[1] <= SLOW_S:
+        since_s = self._busy_since_s
+        waits_s = 0.0 if since_s is None else self._file_time.now_s() - since_s
+        if waits_s <= SLOW_S:
             return ()
         message = "a file of the state folder does not answer; hand-offs, residuals and commands wait for it"
-        return (StandingFault(NAME, "slow", message, busy[0], "the file answers"),)
+        return (StandingFault(NAME, "slow", message, self._clock.now_s() - waits_s, "the file answers"),)
 
     def close(self) -> None:
         """Finish what was put in; bounded."""
@@ -151,7 +152,7 @@ class JournalThread:
                     self._do(act)
 
     def _do(self, act: Callable[[], None]) -> None:
-        self._busy_since_s = self._clock.now_s(), self._file_time.now_s()
+        self._busy_since_s = self._file_time.now_s()
         try:
             act()
         except Exception:  # an unexpected record must not end the thread

@@ -174,18 +174,18 @@ class Metrics:
         yield _gauge("sentinel_look_age_seconds", "Since the last look.", {(): sentinel["age_s"]})
 
 
-def _gauge(name: str, summary: str, values: Mapping[Any, float | None], *labels: str) -> GaugeMetricFamily:
+def _gauge(name: str, summary: str, values: Mapping[Any, float | None], *labels: str) -> Metric:
     """A gauge with its values by labels; what is not known is left out."""
-    family = GaugeMetricFamily(f"mastctl_{name}", summary, labels=labels)
+    return _filled(GaugeMetricFamily(f"mastctl_{name}", summary, labels=labels), values)
+
+
+def _count(name: str, summary: str, values: Mapping[Any, int], *labels: str) -> Metric:
+    """A counter with its values by labels."""
+    return _filled(CounterMetricFamily(f"mastctl_{name}", summary, labels=labels), values)
+
+
+def _filled(family: GaugeMetricFamily | CounterMetricFamily, values: Mapping[Any, float | None]) -> Metric:
     for each, value in values.items():
         if value is not None:
             family.add_metric(each, value)
-    return family
-
-
-def _count(name: str, summary: str, values: Mapping[Any, int], *labels: str) -> CounterMetricFamily:
-    """A counter with its values by labels."""
-    family = CounterMetricFamily(f"mastctl_{name}", summary, labels=labels)
-    for each, value in values.items():
-        family.add_metric(each, value)
     return family
