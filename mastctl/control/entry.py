@@ -199,8 +199,7 @@ class AuditLog:
 
     def faults(self) -> tuple[StandingFault, ...]:
         """Return what is wrong with the file now; takes no lock."""
-        fault = self._fault
-        return () if fault is None else (fault,)
+        return tuple(one for one in (self._fault,) if one is not None)
 
     # In the thread that may wait
 
@@ -212,7 +211,12 @@ class AuditLog:
             self._append("".join(f"{_line(one)}\n" for one in (*lines, record)).encode())
         except Exception as error:  # the disk's, or of a record that cannot be written; the next one may be
             self._lost.append(None)
-            self._fail(error)
+            if self._fault is None:
+                why = (error.strerror if isinstance(error, OSError) else None) or one_line(error, 200)
+                message = f"commands are not recorded: {self._files[0]}: {why}"
+                log.error("%s", message)
+                until, now_s = "a command can be recorded again", self._clock.now_s()
+                self._fault = StandingFault(self._device, "not_recorded", message, now_s, until)
             return
         if lost:
             for _ in range(lost):
@@ -229,14 +233,6 @@ class AuditLog:
                 with contextlib.suppress(FileNotFoundError):
                     newer.replace(older)
             append_line(newest, text, mode=0o600)
-
-    def _fail(self, error: Exception) -> None:
-        why = error.strerror if isinstance(error, OSError) else None
-        message = f"commands are not recorded: {self._files[0]}: {why or one_line(error, 200)}"
-        if self._fault is None:
-            log.error("%s", message)
-            until = "a command can be recorded again"
-            self._fault = StandingFault(self._device, "not_recorded", message, self._clock.now_s(), until)
 
 
 def _line(record: Mapping[str, Any]) -> str:
