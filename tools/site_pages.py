@@ -17,9 +17,9 @@ import calib
 from calib.errors import CalibError
 from drivers import faults
 from drivers.errors import DriverError
+from mastctl.answers import ServiceState
 from mastctl.cli.main import build_parser
 from mastctl.conform.rig_checks import RIG
-from mastctl.control.machine import MEANINGS
 from mastctl.errors import MastctlError
 from mastctl.testing.drivers import test_camera, test_head
 from mastctl.web.app import api, description
@@ -257,12 +257,26 @@ def _errors(*bases: Any) -> Iterator[Any]:
             yield from _errors(kind)
 
 
+STATES: dict[ServiceState, str] = {
+    "closing": "the daemon ends; it has sent a stop to the head",
+    "stopping": "a stop was requested; the head has not confirmed it, or the operation has not ended",
+    "stopped": "an emergency stop is latched: nothing moves until a reset, not even after a restart",
+    "fault": "the head has a fault; the status has its cause, and the event that clears it",
+    "tracking": "a track is active",
+    "moving": "an operation runs, or the head moves",
+    "holding": "at rest after a stop, a reset or a fault: the goal was dropped; the next command starts",
+    "starting": "the head has not been read yet",
+    "ready": "at rest; nothing runs",
+}
+"""The daemon's is the first one in this order that is true: `mastctl.control.machine.Standing`."""
+
+
 def states_page() -> str:
     """Return the states of the daemon, in the order in which they count."""
     explained = "[How a stop is built](../../explanation/safety.md) explains them."
     intro = f"Of several that are true the first counts; {explained}"
     lines = ["# States", "", intro, "", "| state | meaning |", "| --- | --- |"]
-    lines += [f"| `{state}` | {meaning} |" for state, meaning in MEANINGS.items()]
+    lines += [f"| `{state}` | {meaning} |" for state, meaning in STATES.items()]
     return "\n".join([*lines, ""])
 
 

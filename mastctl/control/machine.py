@@ -77,19 +77,6 @@ def latched_sentence(entries: Sequence[Latched]) -> str:
 CLOSING = "the service is closing"
 AFTER_A_STOP = "a stop dropped the goal; the next command starts"
 
-MEANINGS: Mapping[ServiceState, str] = {
-    "closing": "the daemon ends; it has sent a stop to the head",
-    "stopping": "a stop was requested; the head has not confirmed it, or the operation has not ended",
-    "stopped": "an emergency stop is latched: nothing moves until a reset, not even after a restart",
-    "fault": "the head has a fault; the status has its cause, and the event that clears it",
-    "tracking": "a track is active",
-    "moving": "an operation runs, or the head moves",
-    "holding": "at rest after a stop, a reset or a fault: the goal was dropped; the next command starts",
-    "starting": "the head has not been read yet",
-    "ready": "at rest; nothing runs",
-}
-"""The states: the daemon's is the first one in this order that is true."""
-
 Need = Literal["motion", "track", "rest", "idle", "latch"]
 """What a command may need of the present state.
 
@@ -128,7 +115,7 @@ class Standing:
 
     @property
     def state(self) -> ServiceState:
-        """The first of `MEANINGS` that is true."""
+        """The first that is true of those that `reason` explains."""
         return self._judged()[0]
 
     @property
@@ -157,7 +144,7 @@ class Standing:
         if self.dropped:
             return "holding", self.dropped
         if self.head_moves is None:
-            return "starting", MEANINGS["starting"]
+            return "starting", "the head has not been read yet"
         return "ready", ""
 
     def refusal(self, need: Need) -> MastctlError | None:
