@@ -1,11 +1,11 @@
-"""The process that a worker's daemons live in: ``python -m mastctl.testing.daemons PARENT``.
+"""The process that a worker's daemons live in: ``python -m mastctl.testing.daemons PARENT SOCKET``.
 
-It takes one JSON order a line on stdin and answers each with one on stdout. A test gets a daemon of its own;
+It takes one JSON order a line on the socket and answers each with one. A test gets a daemon of its own;
 nothing of the test before is left: no faults, track, stop, mast file in use, place of head and rover, or time
 of the clock.
 
-The process ends when stdin does, and when the process PARENT is gone: a copy of that process, forked by a
-test, may hold stdin open. A worker of pytest-xdist outlives the pytest that made it by many seconds: that
+The process ends when the socket is closed, and when the process PARENT is gone: a copy of that one, forked by
+a test, may hold it open. A worker of pytest-xdist outlives the pytest that made it by many seconds: that
 pytest is watched too.
 """
 
@@ -15,13 +15,15 @@ import json
 import logging
 import math
 import os
+import socket
 import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from calib.errors import BadFile
 from calib.files.mast_file import load_rig, save_rig
@@ -210,20 +212,27 @@ PARENT_CHECKED_S = 0.25
 
 def main() -> None:
     """Serve until no client is left."""
-    parent = int(sys.argv[1])
+    parent, line = int(sys.argv[1]), socket.socket(fileno=int(sys.argv[2]))
+    line.set_inheritable(False)
     threading.Thread(target=_watch, args=(parent,), name="parent watched", daemon=True).start()
-    # Whatever a driver or a library prints is not for the line of answers.
-    with os.fdopen(os.dup(0), "rb") as orders, os.fdopen(os.dup(1), "wb") as answers:
-        with Path(os.devnull).open("rb") as nothing:
-            os.dup2(nothing.fileno(), 0)
-        os.dup2(2, 1)
-        sys.stdout = sys.stderr = queued(2)  # as `mastctl run` says things
-        handler = QueuedHandler(queued(2))
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-        logging.getLogger().addHandler(handler)
-        for name in ("mastctl", "drivers", "calib"):
-            logging.getLogger(name).setLevel(logging.INFO)
-        _serve(orders, answers)
+    sys.stdout = sys.stderr = queued(2)  # as `mastctl run` says things
+    handler = QueuedHandler(queued(2))
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logging.getLogger().addHandler(handler)
+    for name in ("mastctl", "drivers", "calib"):
+        logging.getLogger(name).setLevel(logging.INFO)
+    daemons = Daemons()
+    with line, line.makefile("rb") as orders, suppress(OSError):
+        for text in orders:
+            order: dict[str, Any] = json.loads(text)
+            try:
+                answer = {"done": daemons.do(order.pop("do"), order)}
+            except Exception as error:
+                body = error_body(error)
+                if body["code"] == "internal":
+                    logging.getLogger(__name__).exception("an order failed")
+                answer = {"error": {"code": body["code"], "message": body["message"]}}
+            line.sendall(json.dumps(answer).encode() + b"\n")
     os._exit(0)  # a simulated rover needs no orderly end, and a thread that hangs must not hold this one
 
 
@@ -242,24 +251,6 @@ def _parent_of(pid: int) -> int | None:
     except OSError:
         return None
     return int(after_name.split()[1])
-
-
-def _serve(orders: IO[bytes], answers: IO[bytes]) -> None:
-    daemons = Daemons()
-    for line in orders:
-        order: dict[str, Any] = json.loads(line)
-        try:
-            answer = {"done": daemons.do(order.pop("do"), order)}
-        except Exception as error:
-            body = error_body(error)
-            if body["code"] == "internal":
-                logging.getLogger(__name__).exception("an order failed")
-            answer = {"error": {"code": body["code"], "message": body["message"]}}
-        try:
-            answers.write(json.dumps(answer).encode() + b"\n")
-            answers.flush()
-        except OSError:
-            return
 
 
 if __name__ == "__main__":

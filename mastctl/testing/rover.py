@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import select
+import socket
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
@@ -145,21 +144,24 @@ class RoverProcess:
     def __init__(self, log: Path, workers: int = 1) -> None:
         self.log = log
         self._lock = threading.Lock()
-        self._rest = b""
         cores = len(os.sched_getaffinity(0))
         share = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
         share["NUMBA_NUM_THREADS"] = str(max(1, cores // max(1, workers)))
-        with log.open("ab") as errors:
+        self._line, theirs = socket.socketpair()
+        with log.open("ab") as printed, theirs:
+            fd = theirs.fileno()
             self._process = subprocess.Popen(
                 # -P: a folder of the project named as one of ours ("drivers") is not taken for it.
-                [sys.executable, "-P", "-m", "mastctl.testing.daemons", str(os.getpid())],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=errors,
+                [sys.executable, "-P", "-m", "mastctl.testing.daemons", str(os.getpid()), str(fd)],
+                stdin=subprocess.DEVNULL,
+                stdout=printed,
+                stderr=printed,
+                pass_fds=[fd],
                 env={**share, **os.environ, "TMPDIR": str(log.parent)},  # killed, it clears nothing away
                 # Ctrl-C is for the tests; the daemon is ended by its fixture, after them.
                 start_new_session=True,
             )
+        self._answers = self._line.makefile("rb")
 
     @property
     def pid(self) -> int:
@@ -173,14 +175,14 @@ class RoverProcess:
 
     def request(self, do: str, within_s: float = ANSWER_S, **parameters: Any) -> Any:
         """Have an order carried out, and return its answer. Raises RoverError."""
-        stdin = self._process.stdin
-        assert stdin is not None
         with self._lock:
             try:
-                stdin.write(json.dumps({"do": do, **parameters}).encode() + b"\n")
-                stdin.flush()
-                answer = json.loads(self._line(within_s))
+                self._line.settimeout(within_s)
+                self._line.sendall(json.dumps({"do": do, **parameters}).encode() + b"\n")
+                answer = json.loads(self._answers.readline())
             except (OSError, ValueError) as error:
+                with suppress(subprocess.TimeoutExpired):
+                    self._process.wait(0.0 if isinstance(error, TimeoutError) else END_S)
                 code = self._process.poll()
                 how = f"it ended with {code}" if code is not None else str(error)
                 raise RoverError(f"the daemon's process does not answer: {how}; {self.log}", "gone") from None
@@ -190,29 +192,10 @@ class RoverProcess:
 
     def close(self) -> None:
         """End it; bounded."""
-        process = self._process
-        for stream in (process.stdin, process.stdout):
-            if stream is not None:
-                with suppress(OSError):
-                    stream.close()  # its sign to end
+        self._answers.close()
+        self._line.close()  # its sign to end
         try:
-            process.wait(END_S)
+            self._process.wait(END_S)
         except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-
-    def _line(self, within_s: float) -> bytes:
-        """One line of its stdout."""
-        assert self._process.stdout is not None
-        stdout = self._process.stdout.fileno()
-        until_s = time.monotonic() + within_s
-        while b"\n" not in self._rest:
-            if not select.select([stdout], [], [], max(0.0, until_s - time.monotonic()))[0]:
-                raise OSError(f"nothing came within {within_s:g} s")
-            data = os.read(stdout, 65536)
-            if not data:
-                self._process.wait(END_S)
-                raise OSError("it hung up")
-            self._rest += data
-        line, _, self._rest = self._rest.partition(b"\n")
-        return line
+            self._process.kill()
+            self._process.wait()
