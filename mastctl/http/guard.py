@@ -203,7 +203,7 @@ class Guard:
         self._records = records
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        scope, started, refuses = _stop_scope(scope), False, False
+        scope, started, refuses = _usual(scope), False, False
         line, policy = HTTPConnection(scope), _policy_of_page(scope["path"])
         keep = "no-cache" if policy else "no-store"  # a browser keeps a page, and checks each time
 
@@ -282,9 +282,12 @@ def bounded(receive: Receive) -> Receive:
     return part
 
 
-def _stop_scope(scope: Scope) -> Scope:
-    """Return a POST with empty parts of its path left out, if it is then the path of a stop."""
+def _usual(scope: Scope) -> Scope:
+    """Return a request as the routes know it: a stop's path without empty parts, and files wanted whole.
+
+    A bad range would be refused in another form than all else.
+    """
     path = "/" + "/".join(part for part in scope["path"].split("/") if part)
-    if scope.get("method") == "POST" and path in (*STOPS, TRACK_STOP):
-        return {**scope, "path": path}
-    return scope
+    is_stop = scope.get("method") == "POST" and path in (*STOPS, TRACK_STOP)
+    headers = [one for one in scope["headers"] if one[0] != b"range"]
+    return {**scope, "headers": headers, "path": path if is_stop else scope["path"]}

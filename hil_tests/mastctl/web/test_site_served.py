@@ -53,6 +53,7 @@ def test_a_built_site_is_served_below_docs(client: TestClient) -> None:
     assert page.headers["content-type"].startswith("text/html")
     assert page.headers["cache-control"] == "no-cache"
     assert "frame-ancestors 'none'" in page.headers["content-security-policy"]
+    assert client.get("/docs/start/install.html", headers={"Range": "bytes=x"}).text == page.text
     kept = client.get("/docs/start/install.html", headers={"If-None-Match": page.headers["etag"]})
     assert kept.status_code == 304
     absent = client.get("/docs/start/nothing.html")
