@@ -83,7 +83,6 @@ MODELS = (
     option("--method paper|joint", "paper: cameras first; joint (default): all together, weighted"),
     option("--mast 4|6|8", "mast parameters: 4 upright, 6 as in the paper (default), 8 two skew axes"),
     *MODELS,
-    option("--in-use MAST.yaml", "the mast file to compare with (default: what --out was before)"),
     example="survey --out mast.yaml --report report",
     about="Reads a survey folder (docs/how-to/calibrate.md), checks it, finds dots where "
     "there are none, fits cameras and mast, and writes the mast file with its uncertainty. Every former "
@@ -103,7 +102,7 @@ def _refine(args: argparse.Namespace) -> Answer:
     from mastctl.calibration.run import save_new
     from mastctl.drift.handoffs import read_log
 
-    for name in ("model", "report", "in_use", "method", "mast"):
+    for name in ("model", "report", "method", "mast"):
         if getattr(args, name) is not None:
             option = f"--{name.replace('_', '-')}"
             raise WrongUse(f"{option} belongs to a survey; --refine corrects by hand-offs alone")
@@ -191,12 +190,10 @@ def _compared(args: argparse.Namespace, survey: Survey) -> tuple[dict[str, Any],
 
 
 def _in_use(args: argparse.Namespace) -> StoredRig | None:
-    """The mast file to compare with; one at --out that cannot be read is no reason to stop."""
+    """What --out was before, to compare with; one that cannot be read is no reason to stop."""
     from calib.errors import BadFile
     from calib.files.mast_file import load_rig
 
-    if args.in_use is not None:
-        return load_rig(args.in_use)
     try:
         return load_rig(args.out) if args.out.exists() else None
     except BadFile as error:

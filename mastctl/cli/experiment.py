@@ -190,14 +190,19 @@ def run_bar(args: argparse.Namespace, name: str, total: int | None) -> Iterator[
     It yields a function that is called after each part with what is done now (empty: as before), why the
     part failed (empty: it did not), and what it found if that is worth a line.
     """
-    with output.progress_bar(getattr(args, "json", False)) as progress:  # tools have no --json
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    console = Console(stderr=True, quiet=getattr(args, "json", False))  # tools have no --json
+    with Progress(*columns, console=console) as progress:
         task = progress.add_task(name, total=total)
 
         def step(doing: str, failure: str, found: str = "") -> None:
             if failure:
-                progress.console.print(failure, style="red", markup=False)
+                console.print(failure, style="red", markup=False)
             elif found:
-                progress.console.print(found, markup=False, highlight=False)
+                console.print(found, markup=False, highlight=False)
             progress.update(task, advance=1, description=doing or None)
 
         yield step

@@ -10,10 +10,7 @@ import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
+from typing import Any, NamedTuple
 
 
 class CommandError(Exception):
@@ -229,15 +226,6 @@ def as_command_error(error: BaseException) -> CommandError:
     if isinstance(error, MemoryError):
         return CommandError("out_of_memory", "not enough memory for this input")
     return CommandError("internal", f"a defect of the program: {type(error).__name__}: {error}")
-
-
-def progress_bar(quiet: bool) -> Progress:
-    """Return a progress bar on stderr; ``quiet`` shows nothing."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    return Progress(*columns, console=Console(stderr=True, quiet=quiet))
 
 
 def waiting(quiet: bool, what: str) -> AbstractContextManager[Any]:

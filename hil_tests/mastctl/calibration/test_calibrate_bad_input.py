@@ -239,7 +239,6 @@ def test_a_picture_that_cannot_be_read_is_named_with_the_reason(
         (["--out", "s"], "is a folder"),
         (["--out", "s/survey.yaml"], "is a file of the survey itself"),
         (["--out", "/proc/m.yaml"], "nothing can be written to /proc"),
-        (["--out", "m.yaml", "--in-use", "none.yaml"], "none.yaml: cannot be read"),
     ],
 )
 def test_a_result_that_has_no_place_is_refused_before_the_work(
