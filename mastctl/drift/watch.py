@@ -1,10 +1,12 @@
 """The one watch over the mast file in use: what it counts, where it keeps it, and its verdict.
 
-source               journal                        statistic
-pointings            ``pointings.jsonl``            `mastctl.drift.evidence`, of the last days
-hand-offs            ``pointings.jsonl``            the same
-reference images     `mastctl.drift.pictures`       two looks that find a change, one after the other
-panoramas' seams     the panorama's own folder      of the newest panorama
+Each source has one journal and one statistic.
+
+    source               journal                        statistic
+    pointings            ``pointings.jsonl``            `mastctl.drift.evidence`, of the last days
+    hand-offs            ``pointings.jsonl``            the same
+    reference images     `mastctl.drift.pictures`       two looks that find a change, one after the other
+    panoramas' seams     the panorama's own folder      of the newest panorama
 """
 
 from __future__ import annotations
@@ -113,29 +115,7 @@ class DriftWatch:
         ``drifts`` if any of them says so, else that of the residuals; ``sentence``: of each that speaks
         against the mast file; ``since``: when the first of these began, where one says.
         """
-        return self._together(self._residuals()[0])
-
-    def report(self) -> CalibrationReport:
-        """Return the verdict with the figures of the samples, and the newest pointings, the newest first."""
-        residuals, newest = self._residuals()
-        counted: list[CountedPointing] = [
-            {**one.sample, "sigma_px": one.sigma_px.tolist(), "chi_square": one.square}
-            for one in reversed(newest)
-        ]
-        return {
-            **residuals, **self._together(residuals), "newest": counted, "sentinel": self.pictures
-        }  # fmt: skip
-
-    def faults(self) -> tuple[StandingFault, ...]:
-        """Return which files cannot be written."""
-        return tuple(self._faults.values())
-
-    def _residuals(self) -> tuple[ResidualVerdict, tuple[Judged, ...]]:
-        """The verdict of the samples of the mast file in use, and the newest of them."""
-        digest, verdict, newest = self._judged
-        return (verdict, newest) if digest == self._mast.digest else (no_verdict("few", TOO_FEW), ())
-
-    def _together(self, residuals: ResidualVerdict) -> CalibrationAnswer:
+        residuals, _ = self._residuals()
         looks, slip = self.pictures, self._slip(self._mast.digest)
         against: list[tuple[str, str | None]] = []
         if residuals["verdict"] == "drifts":
@@ -149,6 +129,26 @@ class DriftWatch:
             "pointings": residuals["pointings"],
             "since": min((moment for _, moment in against if moment is not None), default=None),
         }
+
+    def report(self) -> CalibrationReport:
+        """Return the verdict with the figures of the samples, and the newest pointings, the newest first."""
+        residuals, newest = self._residuals()
+        counted: list[CountedPointing] = [
+            {**one.sample, "sigma_px": one.sigma_px.tolist(), "chi_square": one.square}
+            for one in reversed(newest)
+        ]
+        return {
+            **residuals, **self.verdict(), "newest": counted, "sentinel": self.pictures
+        }  # fmt: skip
+
+    def faults(self) -> tuple[StandingFault, ...]:
+        """Return which files cannot be written."""
+        return tuple(self._faults.values())
+
+    def _residuals(self) -> tuple[ResidualVerdict, tuple[Judged, ...]]:
+        """The verdict of the samples of the mast file in use, and the newest of them."""
+        digest, verdict, newest = self._judged
+        return (verdict, newest) if digest == self._mast.digest else (no_verdict("few", TOO_FEW), ())
 
     # In the journals' thread
 
