@@ -18,7 +18,7 @@ import threading
 import time
 from collections.abc import Mapping
 from functools import cache
-from queue import Full, Queue
+from queue import SimpleQueue
 from typing import Literal
 
 log = logging.getLogger(__name__)
@@ -85,7 +85,10 @@ class QueuedText(io.TextIOBase):
 
     def __init__(self, descriptor: int, kept: int = KEPT) -> None:
         self._descriptor = descriptor
-        self._queue: Queue[str | threading.Event] = Queue(kept)
+        self._kept = kept
+        # Without a lock: a text may be written while the same thread is inside this queue, by the garbage
+        # collection or a signal.
+        self._queue: SimpleQueue[str | threading.Event] = SimpleQueue()
         self._dropped = 0
         threading.Thread(target=self._work, name="output", daemon=True).start()
 
@@ -93,9 +96,9 @@ class QueuedText(io.TextIOBase):
         return True
 
     def write(self, text: str) -> int:
-        try:
-            self._queue.put_nowait(text)
-        except Full:
+        if self._queue.qsize() < self._kept:
+            self._queue.put(text)
+        else:
             self._dropped += 1
         return len(text)
 
@@ -105,10 +108,8 @@ class QueuedText(io.TextIOBase):
     def written(self) -> bool:
         """Wait a second at most for all that was written so far; return whether it is out."""
         out = threading.Event()
-        with contextlib.suppress(Full):
-            self._queue.put_nowait(out)
-            return out.wait(FLUSH_S)
-        return False
+        self._queue.put(out)
+        return out.wait(FLUSH_S)
 
     def fileno(self) -> int:
         return self._descriptor

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import signal
 
 from hil_tests.mastctl.outside_daemon import Pipe
 from mastctl.logs import QueuedHandler, QueuedText
@@ -27,3 +28,22 @@ def test_texts_that_do_not_fit_are_dropped_and_counted_in_the_log() -> None:
     stream.write("again\n")
     assert stream.written()
     assert b"again" in pipe.drain(b"again")
+
+
+def test_a_text_may_be_written_while_its_thread_is_writing_one() -> None:
+    pipe = Pipe()
+    stream = QueuedText(pipe.write, kept=1_000_000)
+
+    def interrupted(number: int, frame: object) -> None:  # anywhere, also inside the queue
+        stream.write("x")
+
+    before = signal.signal(signal.SIGALRM, interrupted)
+    signal.setitimer(signal.ITIMER_REAL, 1e-4, 1e-4)
+    try:
+        for _ in range(20_000):
+            stream.write("")
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    stream.write("end\n")
+    assert b"x" in pipe.drain(b"end")
