@@ -93,7 +93,7 @@ def bench_start(images: Sequence[ImageTerm], views: Mapping[str, ViewPoses], att
     elsewhere = {t.board: set[str]() for t in images}
     doubtful = {name for view in views.values() for name in view.doubtful}
     cameras, boards, weight = {}, {}, dict[tuple[str, str], int]()
-    for name in sorted(on_head, key=lambda n: -len(views[n].poses)):
+    for name in sorted(on_head, key=lambda n: (-len(views[n].poses), n)):
         mine = [t for t in images if t.camera == name and t.name in views[name].poses]
         _refuse_still(name, mine)
         tied = _tie(mine, views[name])

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -153,6 +156,17 @@ def test_the_mast_stands_where_level_and_tape_say(
     assert answer["mast"]["rotation_rad"] == pytest.approx([0.0, 0.01, 0.0], abs=1e-12)
     both = "--mast-like", first, "--mast-at", "0", "0", "0", "0", "0", "0"
     assert run(capsys, servo, "--out", second, *both)[0] == 2
+
+
+@pytest.mark.long(1, "two processes, each with a fit of its own")
+def test_a_fit_is_the_same_to_the_last_digit_in_every_process(servo: Path, tmp_path: Path) -> None:
+    found = set()
+    for seed in ("1", "2"):  # of Python's hashes, and so of the order of its sets
+        command = [sys.executable, "-m", "mastctl", "calibrate", "bench", str(servo), "--json"]
+        environment = {**os.environ, "PYTHONHASHSEED": seed}
+        out = subprocess.check_output([*command, "--out", str(tmp_path / "m.yaml")], env=environment)
+        found.add(json.loads(out)["chi2"])
+    assert len(found) == 1
 
 
 def test_a_joint_that_slipped_leaves_no_mast_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
