@@ -55,7 +55,7 @@ def test_the_pointing_loop_runs_on_it(hardware: Hardware, mast_file: Path) -> No
     steps: list[Step] = []
 
     def point(**target: Any) -> PointingResult:
-        loop = PointingLoop(stored.rig, devices, limits, clock, steps.append, threading.Event())
+        loop = PointingLoop(stored.rig, devices, clock, steps.append, threading.Event())
         return loop.run(PointRequest(**target))
 
     try:

@@ -32,7 +32,6 @@ from drivers.clock import Clock
 from mastctl.answers import CameraPixel, Step
 from mastctl.devices.devices import Devices
 from mastctl.devices.joint_history import HeadReading
-from mastctl.devices.judge import Limits
 from mastctl.errors import MastctlError
 from mastctl.motion.measurement import CameraView, available, rounded
 from mastctl.motion.pairs import PairChoice, TrackingSettings, choose_pairs
@@ -111,13 +110,12 @@ class TargetSearch(Steps):
         self,
         rig: Rig,
         devices: Devices,
-        limits: Limits,
         clock: Clock,
         settings: TrackingSettings,
         record: Callable[[Step], None],
         cancelled: threading.Event,
     ) -> None:
-        super().__init__(rig, devices, limits, clock, record, cancelled)
+        super().__init__(rig, devices, clock, record, cancelled)
         self._tracking = settings
 
     def begin_at_pixel(self, target: PixelTarget) -> tuple[Track, TrackSighting]:

@@ -18,7 +18,6 @@ from drivers.clock import Clock
 from mastctl.answers import Step
 from mastctl.devices.devices import Devices
 from mastctl.devices.joint_history import DITHER_RAD, HeadReading, RestWatch
-from mastctl.devices.judge import Limits
 from mastctl.devices.keep_out import KeptOut, Pair
 from mastctl.motion.measurement import (
     CameraView,
@@ -67,7 +66,7 @@ class Steps:
     lie on the way to the commanded angles (a replayed head is there at once). The head has settled when it
     rests (`RestWatch`); it has arrived when it rests where it was sent.
 
-    ``rig`` is the configured part of the mast file in use; ``limits`` are for the choice among solutions.
+    ``rig`` is the configured part of the mast file in use.
     ``record`` gets each step when it ends. ``cancelled`` is set by a stop; the request ends with
     PointingError ``stopped`` soon after. ``last`` is the step that was begun last, ``pointing`` the pointing
     that the next steps belong to, ``motion_evidence`` what the last images say about the move before them, by
@@ -78,7 +77,6 @@ class Steps:
         self,
         rig: Rig,
         devices: Devices,
-        limits: Limits,
         clock: Clock,
         record: Callable[[Step], None],
         cancelled: threading.Event,
@@ -89,7 +87,7 @@ class Steps:
         self.motion_evidence: Mapping[str, Mapping[str, Any]] = {}
         self._rig = rig
         self._devices = devices
-        self._limits = limits
+        self._limits = devices.judge.limits
         self._clock = clock
         self._record = record
         self._cancelled = cancelled

@@ -26,7 +26,6 @@ from mastctl.as_json import as_json
 from mastctl.control.machine import StateMachine
 from mastctl.control.operations import Operation, OperationRunner
 from mastctl.devices.devices import Devices
-from mastctl.devices.judge import Limits
 from mastctl.errors import BadRequest, MastctlError, NotNow
 from mastctl.motion.pairs import TrackingSettings
 from mastctl.motion.requests import TrackRequest
@@ -206,7 +205,6 @@ class Tracker:
         operations: OperationRunner,
         devices: Devices,
         rig: Rig,
-        limits: Limits,
         clock: Clock,
         settings: TrackingSettings,
         on_matched: Callable[[MatchedHandoff], None],
@@ -217,7 +215,6 @@ class Tracker:
         self._operations = operations
         self._devices = devices
         self._rig = rig
-        self._limits = limits
         self._clock = clock
         self._settings = settings
         self._on_matched = on_matched
@@ -355,9 +352,7 @@ class Tracker:
         self._looking_from = pose
 
         def run(record: Callable[[Any], None], cancelled: threading.Event) -> TrackSighting:
-            search = TargetSearch(
-                rig, self._devices, self._limits, self._clock, self._settings, record, cancelled
-            )
+            search = TargetSearch(rig, self._devices, self._clock, self._settings, record, cancelled)
             with self._devices.exposure_fixed():
                 outcomes.append(work(search))
             return outcomes[0][1]

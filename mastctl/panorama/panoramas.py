@@ -77,7 +77,7 @@ class Panoramas:
         is left of one that is refused.
         """
         with self._unchanged() as mast:
-            rig, limits, began_s = self._rig(), self._devices.judge.limits, self._clock.now_s()
+            rig, began_s = self._rig(), self._clock.now_s()
         if body.resume is not None:
             folder = Folder(self.open(body.resume).path)
             self._check_mast(folder, mast)
@@ -95,7 +95,7 @@ class Panoramas:
                 raise Unable("unwritable", str(error)) from None
 
         def run(record: Callable[[Any], None], cancelled: threading.Event) -> Any:
-            parts = rig, self._devices, limits, self._clock, record, cancelled
+            parts = rig, self._devices, self._clock, record, cancelled
             result = PanoramaTaker(*parts).take(folder, self._devices)
             self._newest = folder.index
             return result

@@ -181,7 +181,6 @@ class Service:
             self.operations,
             self.devices,
             mast.rig,
-            config.limits,
             clock,
             config.tracking,
             self._handed_over,

@@ -162,10 +162,9 @@ class Steering:
         self._devices.judge.rover_stands(pose.site_from_rover.inverse.rotation)
 
     def _loop(self) -> Callable[[Callable[[Any], None], threading.Event], PointingLoop]:
-        """Return what makes a pointing by the mast file and the limits of now."""
-        limits = self._devices.judge.limits
+        """Return what makes a pointing by the mast file of now."""
         rig, wait_s = self._masts.in_use.rig, self._repeat_after_s
-        return partial(PointingLoop, rig, self._devices, limits, self._clock, repeat_after_s=wait_s)
+        return partial(PointingLoop, rig, self._devices, self._clock, repeat_after_s=wait_s)
 
     def _in_rover(self, request: R) -> R:
         """Return a request in the rover frame of now; before a pose, site and rover are one."""

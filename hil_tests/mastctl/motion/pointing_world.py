@@ -117,6 +117,7 @@ class World:
     stops: int = 0
     digest: str = "0" * 64
     scene: Callable[[], TexturedPlane | Edge] = ground
+    limits: Limits = LIMITS
 
     def __post_init__(self) -> None:
         self.store = self.judge = self  # as parts of the devices
@@ -253,11 +254,10 @@ def loop_of(
     believed: Rig | None = None,
     cancelled: threading.Event | None = None,
     repeat_after_s: float = REPEAT_AFTER_S,
-    limits: Limits = LIMITS,
 ) -> PointingLoop:
     """A request's loop, whose steps come to a list."""
     stopped = cancelled or threading.Event()
-    parts = believed or rig(), world, limits, world.clock, steps.append, stopped
+    parts = believed or rig(), world, world.clock, steps.append, stopped
     return PointingLoop(*parts, repeat_after_s=repeat_after_s)
 
 

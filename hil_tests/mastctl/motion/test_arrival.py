@@ -28,6 +28,7 @@ class Turning:
     def __init__(self, at: Callable[[float], tuple[float, float, bool]]) -> None:
         self.at = at
         self.judge = self
+        self.limits = Limits((-2.0, 2.0), (-1.0, 1.0), SPEED_RAD_PER_S)
         self.clock = ManualClock(100.0)
         self.moves: list[tuple[float, float]] = []
         self.stamp: Callable[[Reading], Reading] = lambda reading: reading
@@ -49,9 +50,8 @@ class Turning:
 
 
 def request(turning: Turning, cancelled: threading.Event | None = None) -> Steps:
-    limits, stopped = Limits((-2.0, 2.0), (-1.0, 1.0), SPEED_RAD_PER_S), cancelled or threading.Event()
-    steps: list[Any] = []
-    return Steps(rig(), turning, limits, turning.clock, steps.append, stopped)  # type: ignore[arg-type]
+    stopped, steps = cancelled or threading.Event(), list[Any]()
+    return Steps(rig(), turning, turning.clock, steps.append, stopped)  # type: ignore[arg-type]
 
 
 def standing(pan_rad: float = 0.3, tilt_rad: float = -0.2) -> Turning:

@@ -131,7 +131,6 @@ class Rover:
         self.devices = Devices(
             self.hardware.pan_tilt, self.hardware.cameras, limits, "0" * 64, self.clock, self.rig
         )
-        self.limits = limits
         assert self.hardware.simulation is not None
         self.truth = self.hardware.simulation
 
@@ -148,7 +147,7 @@ class Rover:
     def point(
         self, request: PointRequest, record: Callable[[Step], None] = lambda step: None
     ) -> PointingResult:
-        parts = self.rig, self.devices, self.limits, self.clock, record, threading.Event()
+        parts = self.rig, self.devices, self.clock, record, threading.Event()
         return PointingLoop(*parts).run(request)
 
     def _first_frame(self) -> StampedFrame:

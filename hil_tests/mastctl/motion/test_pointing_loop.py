@@ -296,8 +296,8 @@ def test_a_preview_tells_what_a_pointing_then_finds_and_nothing_moves() -> None:
 def test_a_preview_of_what_the_head_cannot_reach_still_tells_where_it_is() -> None:
     world = World()
     frame = world.shoot()
-    level = replace(LIMITS, tilt_rad=(-0.001, 0.001))
-    told = loop_of(world, [], limits=level).preview(click(frame, 150.0, 60.0))
+    world.limits = replace(LIMITS, tilt_rad=(-0.001, 0.001))
+    told = loop_of(world, []).preview(click(frame, 150.0, 60.0))
     assert told["range_m"] > 0.5
     assert told["refused"] is not None and told["refused"]["code"] == "outside_limits", told["refused"]
     assert (world.moves, world.stops) == ([], 0)

@@ -16,7 +16,7 @@ from calib.geometry.rig import Rig
 from calib.geometry.rigid import Rigid
 from calib.matching.track import Track, moved_track
 from drivers.errors import NoReply
-from hil_tests.mastctl.motion.pointing_world import LIMITS, SIZE_PX, World, rig
+from hil_tests.mastctl.motion.pointing_world import SIZE_PX, World, rig
 from mastctl.answers import Step
 from mastctl.devices.frames import StampedFrame
 from mastctl.motion.pairs import TrackingSettings
@@ -49,7 +49,7 @@ class Eyes(World):
 def search(world: World, steps: list[Step] | None = None, believed: Rig | None = None) -> TargetSearch:
     record = ([] if steps is None else steps).append
     settings, stopped = TrackingSettings(), threading.Event()
-    return TargetSearch(believed or rig(), world, LIMITS, world.clock, settings, record, stopped)  # type: ignore[arg-type]
+    return TargetSearch(believed or rig(), world, world.clock, settings, record, stopped)  # type: ignore[arg-type]
 
 
 def begun(world: World) -> tuple[Track, np.ndarray]:

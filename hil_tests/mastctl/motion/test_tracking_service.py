@@ -46,8 +46,8 @@ class ScriptedSearch(Steps):
     begin: Callable[[], None] = lambda: None
     looks: list[Track]
 
-    def __init__(self, rig: Any, devices: Any, limits: Any, clock: Any, settings: Any, *others: Any) -> None:
-        super().__init__(rig, devices, limits, clock, *others)
+    def __init__(self, rig: Any, devices: Any, clock: Any, settings: Any, *others: Any) -> None:
+        super().__init__(rig, devices, clock, *others)
 
     def begin_at_pixel(self, target: Any) -> tuple[Track, TrackSighting]:
         with self.step("start"):
