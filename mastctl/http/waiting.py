@@ -123,7 +123,7 @@ class Streams:
     def __init__(self, publisher: Publisher) -> None:
         self._publisher = publisher
         self._open: dict[LoopSubscription, str] = {}
-        self._ended = False
+        self.ended = False  # whether the daemon ends
 
     @contextmanager
     def listening(
@@ -134,7 +134,7 @@ class Streams:
         ``credential`` is the digest of the client's token, with which the stream ends; empty for none. Raises
         Unable ``too_many``, ``closing``.
         """
-        if self._ended:
+        if self.ended:
             raise Unable("closing", "the daemon ends; no more events follow")
         if len(self._open) >= MOST_STREAMS:
             raise Unable("too_many", f"{MOST_STREAMS} event streams are open, the most there may be", RETRY_S)
@@ -151,14 +151,9 @@ class Streams:
             if credential and not valid(credential):
                 news.close()
 
-    @property
-    def ended(self) -> bool:
-        """Whether the daemon ends."""
-        return self._ended
-
     async def end(self) -> None:
         """Let every stream send its last events, and end; clients that do not read are not waited for."""
-        self._ended = True
+        self.ended = True
         for news in tuple(self._open):
             news.close()
         with move_on_after(END_S):

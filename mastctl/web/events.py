@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator
 from typing import Annotated, Self, cast
 from weakref import WeakKeyDictionary
 
@@ -105,22 +105,19 @@ class _Lines(StreamingResponse):
             await super().__call__(scope, receive, send)
 
     async def _lines(self) -> AsyncIterator[str]:
-        news = self._news
-        while True:
-            found = await news.wait(ALIVE_S)
-            for some in _by_few(found):
-                await self._here.waiting.turn()
-                lines = [(one.sequence, _event(self._here.service, one, news.lost)) for one in some]
-                yield "".join(f"id: {number}\ndata: {text}\n\n" for number, text in lines)
-            if not found:
-                if news.closed:
-                    return
-                yield ": alive\n\n"
+        async for some in _texts_of(self._here, self._news):
+            yield "".join(f"id: {number}\ndata: {text}\n\n" for number, text in some) or ": alive\n\n"
 
 
-def _by_few(found: Sequence[Published]) -> Iterator[Sequence[Published]]:
-    """Events in pieces that keep a stop waiting for a moment only."""
-    return (found[begin : begin + AT_ONCE] for begin in range(0, len(found), AT_ONCE))
+async def _texts_of(here: Parts, news: LoopSubscription) -> AsyncIterator[list[tuple[int, str]]]:
+    """Numbers and texts of events until they end, by so few that a stop waits for a moment only; none of them
+    where nothing changes for a while.
+    """
+    while (found := await news.wait(ALIVE_S)) or not news.closed:
+        for begin in range(0, max(len(found), 1), AT_ONCE):
+            await here.waiting.turn()
+            some = found[begin : begin + AT_ONCE]
+            yield [(one.sequence, _event(here.service, one, news.lost)) for one in some]
 
 
 async def _send(line: WebSocket, news: LoopSubscription, here: Parts) -> None:
@@ -129,11 +126,9 @@ async def _send(line: WebSocket, news: LoopSubscription, here: Parts) -> None:
     gone = asyncio.ensure_future(line.receive())  # a client's only message is its end
     gone.add_done_callback(lambda _: news.close())
     try:
-        while found := await news.wait():
-            for some in _by_few(found):
-                await here.waiting.turn()
-                for one in some:
-                    await line.send_text(_event(here.service, one, news.lost))
+        async for some in _texts_of(here, news):
+            for _, text in some:
+                await line.send_text(text)
         if not gone.done():
             await close_ended(line, here)
         elif gone.result()["type"] == "websocket.receive":
