@@ -31,11 +31,10 @@ from mastctl.answers import (
 )
 from mastctl.control.machine import StandingFault
 from mastctl.control.operations import Operation
-from mastctl.drift.evidence import DAY_S, DAYS, KEPT, TOO_FEW, Judged, Windows, no_verdict, verdict_of
+from mastctl.drift import evidence
 from mastctl.drift.handoffs import handoff_log, line_of
 from mastctl.drift.journal import NAME, Journal, JournalThread
 from mastctl.drift.pictures import FOLDER, Findings
-from mastctl.drift.samples import HANDOFF, handoff_samples, pointing_sample, sample_of
 
 log = logging.getLogger(__name__)
 
@@ -46,9 +45,13 @@ SHOWN = 50
 """Newest pointings that are shown one by one."""
 
 
+Found = tuple[ResidualVerdict, tuple[evidence.Judged, ...]]
+NOTHING_YET: Found = evidence.no_verdict("few", evidence.TOO_FEW), ()
+
+
 def sample_journal(folder: Path) -> Journal[MeasuredPointing]:
     """Return the journal of samples in a state folder."""
-    return Journal(folder / FILE, "pointings", sample_of, most_bytes=MOST_BYTES)
+    return Journal(folder / FILE, "pointings", evidence.sample_of, most_bytes=MOST_BYTES)
 
 
 class DriftWatch:
@@ -77,18 +80,18 @@ class DriftWatch:
         self._handoffs = None if handoff_path is None else handoff_log(handoff_path)
         self._findings = Findings(folder / FOLDER)
         # Of the journals' thread, read by others
-        self._judged: tuple[str, ResidualVerdict, tuple[Judged, ...]] = "", no_verdict("few", TOO_FEW), ()
+        self._judged = "", NOTHING_YET
         self._faults: Mapping[Path, StandingFault] = {}
         # Of that thread alone
-        self._samples: deque[MeasuredPointing] = deque(maxlen=KEPT)
-        self._windows: Windows | None = None
+        self._samples: deque[MeasuredPointing] = deque(maxlen=evidence.KEPT)
+        self._windows: evidence.Windows | None = None
         self._drifted = False
         thread.put(self._read)
         thread.poll(self._poll)
 
     def ended(self, mast: StoredRig, operation: Operation) -> None:
         """Count what a pointing measured, if it did; ``mast`` was in use when it began."""
-        one = pointing_sample(operation, mast, self._wall_s())
+        one = evidence.pointing_sample(operation, mast, self._wall_s())
         if one is not None:
             self._thread.put(lambda: self._count(one))
 
@@ -96,7 +99,7 @@ class DriftWatch:
         """Count a hand-off, and have it logged."""
         mast, time_s = self._mast, self._wall_s()
         self._thread.put(lambda: self._log_handoff(handoff))
-        for one in handoff_samples(handoff, mast, time_s):
+        for one in evidence.handoff_samples(handoff, mast, time_s):
             self._thread.put(lambda one=one: self._count(one))  # type: ignore[misc]
 
     def use_mast(self, mast: StoredRig) -> None:
@@ -145,10 +148,10 @@ class DriftWatch:
         """Return which files cannot be written."""
         return tuple(self._faults.values())
 
-    def _residuals(self) -> tuple[ResidualVerdict, tuple[Judged, ...]]:
+    def _residuals(self) -> Found:
         """The verdict of the samples of the mast file in use, and the newest of them."""
-        digest, verdict, newest = self._judged
-        return (verdict, newest) if digest == self._mast.digest else (no_verdict("few", TOO_FEW), ())
+        digest, found = self._judged
+        return found if digest == self._mast.digest else NOTHING_YET
 
     # In the journals' thread
 
@@ -161,7 +164,7 @@ class DriftWatch:
 
     def _count(self, one: MeasuredPointing) -> None:
         self._samples.append(one)
-        recent_s = self._wall_s() - DAYS * DAY_S
+        recent_s = self._wall_s() - evidence.DAYS * evidence.DAY_S
         counting = [kept for kept in self._samples if kept["time_s"] > recent_s]
         self._write(self._journal.path, lambda: self._journal.append(one, counting))
         if self._windows is not None:
@@ -188,11 +191,11 @@ class DriftWatch:
 
     def _judge_by(self, mast: StoredRig) -> None:
         try:
-            self._windows = Windows(mast)
+            self._windows = evidence.Windows(mast)
         except CalibError as error:
             self._windows = None
             sentence = f"residuals are kept, and judged by nothing: {error}"
-            self._judged = mast.digest, no_verdict("unknown", sentence), ()
+            self._judged = mast.digest, (evidence.no_verdict("unknown", sentence), ())
             return
         for one in self._samples:
             self._windows.add(one)
@@ -202,9 +205,9 @@ class DriftWatch:
         windows = self._windows
         assert windows is not None
         windows.forget(self._wall_s())
-        verdict = verdict_of(windows.evidence(), len(windows.judged))
-        pointings = [one for one in windows.judged if one.sample["operation"] != HANDOFF]
-        self._judged = windows.digest, verdict, tuple(pointings[-SHOWN:])
+        verdict = evidence.verdict_of(windows.evidence(), len(windows.judged))
+        pointings = [one for one in windows.judged if one.sample["operation"] != evidence.HANDOFF]
+        self._judged = windows.digest, (verdict, tuple(pointings[-SHOWN:]))
 
     def _poll(self) -> None:
         self._findings.poll()

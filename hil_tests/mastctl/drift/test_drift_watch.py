@@ -22,10 +22,10 @@ from mastctl.answers import MeasuredPointing
 from mastctl.control.operations import Operation
 from mastctl.drift import journal
 from mastctl.drift import watch as module
+from mastctl.drift.evidence import pointing_sample, sample_of
 from mastctl.drift.handoffs import read_log
 from mastctl.drift.journal import NAME, Journal, JournalThread
 from mastctl.drift.pictures import LOOKS, ReferencePicture, save_reference
-from mastctl.drift.samples import pointing_sample, sample_of
 from mastctl.drift.watch import FILE, DriftWatch, sample_journal
 
 STORED = stored_rig()

@@ -18,8 +18,7 @@ from hil_tests.mastctl.drift.histories import (
     pointing,
     stored_rig,
 )
-from mastctl.drift.evidence import LOG_THRESHOLD, Judge, Windows, rows_of, verdict_of
-from mastctl.drift.samples import handoff_samples
+from mastctl.drift.evidence import LOG_THRESHOLD, Judge, Windows, handoff_samples, rows_of, verdict_of
 
 CAMERAS = ("pancam_left", "navcam_left", "navcam_right")
 BUMP_RAD = 2e-3
