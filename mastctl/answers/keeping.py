@@ -7,7 +7,6 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal, NotRequired
 
 from annotated_types import Ge, Gt, Len
-from pydantic import ConfigDict, with_config
 from typing_extensions import TypedDict
 
 from mastctl.answers.status import (
@@ -110,7 +109,6 @@ class CameraTurn(TypedDict):
     log10_evidence: float
 
 
-@with_config(ConfigDict(allow_inf_nan=False))
 class MeasuredPointing(TypedDict):
     """A pointing of which a new image was taken, or one camera's part of a hand-off.
 
@@ -137,6 +135,10 @@ class MeasuredPointing(TypedDict):
     match_sigma_px: Annotated[list[Annotated[float, Gt(0.0)]], Len(2, 2)]
     count_rad: Annotated[list[Annotated[float, Ge(0.0)]], Len(2, 2)]
     click_sigma_px: NotRequired[Annotated[float, Gt(0.0)]]
+
+
+# As `pydantic.with_config` does: the client alone has no pydantic.
+MeasuredPointing.__pydantic_config__ = {"allow_inf_nan": False}  # type: ignore[attr-defined]
 
 
 class CountedPointing(MeasuredPointing):
