@@ -98,8 +98,7 @@ def _refine(args: argparse.Namespace) -> Answer:
     """Propose a correction by hand-offs as a new mast file; 1, and no file, if they show none."""
     from calib.errors import NoCorrection
     from calib.files.mast_file import load_rig
-    from mastctl.calibration.refined import refine
-    from mastctl.calibration.run import save_new
+    from mastctl.calibration.run import refine, save_new
     from mastctl.drift.handoffs import read_log
 
     for name in ("model", "report", "method", "mast"):
