@@ -176,9 +176,9 @@ class AuditLog:
         path: Path,
         later: Callable[[Callable[[], None]], None],
         clock: Clock,
-        file_bytes: int = FILE_BYTES,
         files: int = FILES,
         device: str = AUDIT,
+        file_bytes: int = FILE_BYTES,
     ) -> None:
         self._files = [path, *(Path(f"{path}.{number}") for number in range(1, files))]
         self._file_bytes = file_bytes
@@ -250,8 +250,8 @@ def _json(value: Any) -> str:
 class CommandEntry:
     """The entry of one daemon; safe to use from any thread.
 
-    ``publisher`` gets each record, and keeps the newest. ``strangers`` is the log for strangers, who may be
-    many: they push no other record out of ``audit``.
+    ``publisher`` gets each record, and keeps the newest; so do two files in ``folder``, of which that for
+    strangers, who may be many, pushes no other record out. ``later`` is as of `AuditLog`.
     """
 
     def __init__(
@@ -259,19 +259,23 @@ class CommandEntry:
         clock: Clock,
         leases: LeaseTable,
         answers: Answers,
-        audit: AuditLog,
         operations: OperationRunner,
         publisher: Publisher,
-        strangers: AuditLog,
+        folder: Path,
+        later: Callable[[Callable[[], None]], None],
     ) -> None:
         self.leases = leases
-        self.audit = audit
-        self.strangers = strangers
+        self._audit = AuditLog(folder / "audit.jsonl", later, clock)
+        self._strangers = AuditLog(folder / "strangers.jsonl", later, clock, STRANGERS_FILES, STRANGERS)
         self._clock = clock
         self._answers = answers
         self._operations = operations
         self._publisher = publisher
         self._numbers = itertools.count(1)
+
+    def faults(self) -> tuple[StandingFault, ...]:
+        """Return what is wrong with the files of records; takes no lock."""
+        return *self._audit.faults(), *self._strangers.faults()
 
     def run(
         self, command: Command, sent: CommandRequest, act: Callable[[], Answer], usual_s: float | None = None
@@ -322,14 +326,14 @@ class CommandEntry:
     def refused(self, caller: Caller, command: str, code: str, message: str) -> None:
         """Record a request that was refused before it was a command. It is not published."""
         line = {**self._begun(), **_by(command, caller), "request": {}, "result": code, "message": message}
-        (self.strangers if caller.stranger else self.audit).put(line)
+        (self._strangers if caller.stranger else self._audit).put(line)
 
     def ended(self, operation: str, state: str, error: Mapping[str, Any] | None) -> None:
         """Record how an operation ended."""
         line = {**self._begun(), "ended": operation, "state": state}
         if error is not None:
             line |= {"code": error.get("code"), "message": error.get("message")}
-        self._write(self.audit, line)
+        self._write(self._audit, line)
 
     def record(
         self,
@@ -353,7 +357,7 @@ class CommandEntry:
         else:
             body = error_body(error)
             line |= {"result": body["code"], "message": body["message"]}
-        self._write(self.strangers if sent.caller.stranger else self.audit, line)
+        self._write(self._strangers if sent.caller.stranger else self._audit, line)
 
     def _act(
         self, command: Command, sent: CommandRequest, act: Callable[[], Answer], usual_s: float | None

@@ -35,10 +35,7 @@ from mastctl.config import Config
 from mastctl.control.entry import (
     ESTOP,
     STOP,
-    STRANGERS,
-    STRANGERS_FILES,
     Answers,
-    AuditLog,
     CommandEntry,
     CommandRequest,
 )
@@ -79,8 +76,6 @@ SNAPSHOT_AGE_S = 1.0  # a snapshot that need not be fresh may be this old
 SNAPSHOT_TIMEOUT_S = 5.0
 RENDERING_S = 20.0  # six simulated cameras share one renderer, on a machine that may be busy
 HARDWARE_CLOSE_S = 3.0
-AUDIT_FILE = "audit.jsonl"
-STRANGERS_FILE = "strangers.jsonl"
 RECORDS_FOLDER = "records"
 KEPT_PICTURES = 8  # of a camera
 
@@ -132,15 +127,8 @@ class Service:
         real_time = SystemClock()  # clients live in it, whatever a simulated rover's clock does
         self.leases = LeaseTable(real_time, self.machine.something_runs, self._steered, self.stopping.stop)
         threading.Thread(target=self.leases.watch, name="leases", daemon=True).start()
-        later = self.journals.put
-        self.audit = AuditLog(folder.path / AUDIT_FILE, later, clock)
-        self.strangers = AuditLog(
-            folder.path / STRANGERS_FILE, later, clock, files=STRANGERS_FILES, device=STRANGERS
-        )
-        answers = Answers(real_time, clock)
-        self.entry = CommandEntry(
-            clock, self.leases, answers, self.audit, self.operations, publisher, self.strangers
-        )
+        answers, later = Answers(real_time, clock), self.journals.put
+        self.entry = CommandEntry(clock, self.leases, answers, self.operations, publisher, folder.path, later)
         self.bench = BenchOperation(
             self.folder.path,
             lambda: self.masts.in_use.path.parent,
@@ -395,8 +383,7 @@ class Service:
             *self.drift.faults(),
             *self.journals.faults(),
             *self.recorder.faults(),
-            *self.audit.faults(),
-            *self.strangers.faults(),
+            *self.entry.faults(),
             *latch_faults(self.latch),
         )
 

@@ -16,7 +16,6 @@ from mastctl.control.entry import (
     ESTOP,
     STOP,
     Answers,
-    AuditLog,
     Command,
     CommandEntry,
     CommandRequest,
@@ -43,10 +42,6 @@ class World:
         self.leases = LeaseTable(self.clock, lambda: self.runs)
         self.path = path
         self.thread = JournalThread(self.clock)
-        small: dict[str, Any] = {"file_bytes": 50_000, "files": 2}
-        self.audit = AuditLog(path, self.thread.put, self.clock, **small)
-        strangers = path.with_name("strangers.jsonl")
-        self.strangers = AuditLog(strangers, self.thread.put, self.clock, **small)
         self.deadlines: list[tuple[str, float, float]] = []
         self.ended_by_stop: list[str] = []
         self.refuses: str | None = None
@@ -55,10 +50,10 @@ class World:
             self.clock,
             self.leases,
             Answers(self.clock),
-            self.audit,
             cast(OperationRunner, self),
             self.publisher,
-            self.strangers,
+            path.parent,
+            self.thread.put,
         )
         self.acts = 0
 

@@ -34,7 +34,7 @@ def test_ages_count_to_one_moment_and_are_never_below_zero() -> None:
     assert (camera["frame_id"], camera["sequence"], camera["exposure_s"]) == ("id", 7, 0.01)
 
 
-@pytest.mark.parametrize("part", ["drift", "recorder", "audit"])
+@pytest.mark.parametrize("part", ["drift", "recorder", "entry"])
 def test_each_own_fault_is_published_and_in_the_status(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, part: str
 ) -> None:
