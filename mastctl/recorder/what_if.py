@@ -208,9 +208,6 @@ def pointings_with(rig: Rig, seen: Sequence[SeenAgain]) -> list[dict[str, Any]]:
             "pointing": one.pointing,
             "frame_id": one.frame_id,
             "recorded_px": one.target_px - one.aim_px,
-            "recorded_commanded_rad": one.commanded_rad,
-            "commanded_rad": None,
-            "range_m": None,
             "would_be_px": None,
             "sigma_px": None,
             "error": "",
@@ -219,22 +216,16 @@ def pointings_with(rig: Rig, seen: Sequence[SeenAgain]) -> list[dict[str, Any]]:
         try:
             if missing:
                 raise CalibError(f"the mast file has no camera {missing[0]}")
-            commanded, range_m, residual = _residual(rig, one, one.pair_px, one.servo_rad)
-            sigma = _sigma(rig, one, residual, servo_rad)
-            row |= {"commanded_rad": commanded, "range_m": range_m}
-            row |= {"would_be_px": residual, "sigma_px": sigma}
+            residual = _residual(rig, one, one.pair_px, one.servo_rad)
+            row |= {"would_be_px": residual, "sigma_px": _sigma(rig, one, residual, servo_rad)}
         except CalibError as error:
             row["error"] = " ".join(str(error).split())
         found.append(as_json(row))
     return found
 
 
-def _residual(
-    rig: Rig, seen: SeenAgain, pair_px: FloatArray, servo_rad: FloatArray
-) -> tuple[tuple[float, float], float, FloatArray]:
-    """Commanded angles, range and residual of a pointing with a mast file, of the pair's pixels (2, 2) and
-    the servos' error (2,). Raises CalibError.
-    """
+def _residual(rig: Rig, seen: SeenAgain, pair_px: FloatArray, servo_rad: FloatArray) -> FloatArray:
+    """(2,) residual of the pair's pixels (2, 2) and the servos' error (2,). Raises CalibError."""
     joints, came = rig.joints, seen.measured_approach
     at = joints.true_rad(seen.pair_rad, seen.pair_approach)
     one, other = (rig.camera_in_rover(name, *at) for name in seen.pair)
@@ -244,13 +235,12 @@ def _residual(
     pan, tilt = seen.commanded_rad
     chosen = min(solutions, key=lambda s: max(abs(s.pan_rad - pan), abs(s.tilt_rad - tilt)))
     ray = rig.camera_in_rover(seen.aim_camera, *joints.true_rad(seen.measured_rad, came)).ray(seen.target_px)
-    range_m = float(np.linalg.norm(target - ray.origins_m))
-    position_m = ray.origins_m + range_m * ray.directions
+    position_m = ray.origins_m + np.linalg.norm(target - ray.origins_m) * ray.directions
     commanded = joints.read_rad((chosen.pan_rad, chosen.tilt_rad), came)
     reached = commanded[0] + float(servo_rad[0]), commanded[1] + float(servo_rad[1])
     camera = rig.camera_in_rover(seen.aim_camera, *joints.true_rad(reached, came))
     pixel, _ = camera.project(position_m)
-    return commanded, range_m, np.asarray(pixel - seen.aim_px, dtype=float)
+    return np.asarray(pixel - seen.aim_px, dtype=float)
 
 
 def _sigma(rig: Rig, seen: SeenAgain, residual_px: FloatArray, servo_rad: FloatArray) -> FloatArray:
@@ -262,7 +252,7 @@ def _sigma(rig: Rig, seen: SeenAgain, residual_px: FloatArray, servo_rad: FloatA
     for at, (sigma, step) in enumerate(zip(sigmas, [STEP_PX] * 4 + [STEP_RAD] * 2, strict=True)):
         changed = measured.copy()
         changed[at] += step
-        _, _, moved_px = _residual(rig, seen, changed[:4].reshape(2, 2), changed[4:])
+        moved_px = _residual(rig, seen, changed[:4].reshape(2, 2), changed[4:])
         variance = variance + np.square((moved_px - residual_px) / step * sigma)
     return np.sqrt(variance)
 
