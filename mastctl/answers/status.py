@@ -154,12 +154,12 @@ class SensorModeAnswer(TypedDict):
 
 
 class CameraSettingsAnswer(TypedDict):
-    """The settings of a camera; ``held``: an operation keeps them as they are; ``sensor_mode`` as it was
+    """The settings of a camera; ``fixed``: an operation keeps them as they are; ``sensor_mode`` as it was
     opened; ``notes``: a sentence for each setting that became another than requested."""
 
     camera: str
     settings: list[CameraSettingAnswer]
-    held: bool
+    fixed: bool
     sensor_mode: SensorModeAnswer | None
     notes: list[str]
 

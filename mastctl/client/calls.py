@@ -25,7 +25,7 @@ class Calls:
     daemon: DaemonHttp
 
     def camera_settings(self, camera: str) -> answers.CameraSettingsAnswer:
-        """Return what of a camera can be changed: ``settings`` with bounds, and whether they are ``held``."""
+        """Return what of a camera can be changed: ``settings`` with bounds, whether they are ``fixed``."""
         return self.daemon.json(answers.CameraSettingsAnswer, "GET", f"/cameras/{escaped(camera)}/settings")
 
     def set_camera(self, camera: str, **settings: float) -> answers.CameraSettingsAnswer:

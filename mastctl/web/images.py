@@ -128,7 +128,7 @@ def _settings(here: Parts, camera: str, notes: list[str]) -> CameraSettingsAnswe
         "settings": [
             as_json(one) | {"unit": SETTINGS[one.name], "refusal": one.refusal or None} for one in found
         ],
-        "held": fixed,
+        "fixed": fixed,
         "sensor_mode": None if mode is None else as_json(mode) | {"flip": flip_name(mode.flip)},
         "notes": notes,
     }

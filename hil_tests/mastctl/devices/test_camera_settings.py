@@ -81,7 +81,7 @@ def refused(code: str, act: Any) -> str:
 
 def test_each_setting_is_told_with_value_bounds_and_unit(client: Client, left: SetCamera) -> None:
     told = client.camera_settings("navcam_left")
-    assert told["camera"] == "navcam_left" and not told["held"] and not told["notes"]
+    assert told["camera"] == "navcam_left" and not told["fixed"] and not told["notes"]
     assert told["settings"][0] == {
         "name": "exposure_s", "value": 0.01, "minimum": 0.001, "maximum": 0.04, "step": 0.0001, "unit": "s",
         "automatic": False, "refusal": None,
@@ -160,13 +160,13 @@ def test_an_operation_finds_them_held(client: Client, left: SetCamera, monkeypat
     monkeypatch.setattr(ScriptedLoop, "script", staticmethod(script))
     operation = client.point(pan_rad=0.1, tilt_rad=0.1)
     assert looks.wait(NET_S)
-    assert client.camera_settings("navcam_left")["held"]
+    assert client.camera_settings("navcam_left")["fixed"]
     assert f"operation {operation} is running" in refused(
         "busy", lambda: client.set_camera("navcam_left", gain=4)
     )
     over.set()
     client.wait(operation)
-    until(lambda: not client.camera_settings("navcam_left")["held"], "the release")
+    until(lambda: not client.camera_settings("navcam_left")["fixed"], "the release")
     client.set_camera("navcam_left", gain=4)
     assert left.sets == [{"gain": 4.0}]
 

@@ -55,7 +55,7 @@ export class Settings {
   told(now, own = false) {
     if (now.camera !== this.choice.value) return;
     if (!own && this.now?.camera === now.camera && this.rows.contains(document.activeElement)) {
-      this.now.held = now.held;
+      this.now.fixed = now.fixed;
       return this.draw();
     }
     this.now = now;
@@ -70,10 +70,10 @@ export class Settings {
 
   draw() {
     if (!this.now) return;
-    const can = Boolean(this.may && held.lease && !this.now.held);
+    const can = Boolean(this.may && held.lease && !this.now.fixed);
     for (const [one, field] of this.fields) field.disabled = !can || Boolean(one.refusal);
     this.set.disabled = !can || !this.now.settings.length;
-    say(this.hint, !this.now.settings.length ? "Nothing of this camera can be changed while it runs." : this.now.held ? "An operation holds them." : this.may && !held.lease ? "Take control to change them." : "");
+    say(this.hint, !this.now.settings.length ? "Nothing of this camera can be changed while it runs." : this.now.fixed ? "An operation keeps them." : this.may && !held.lease ? "Take control to change them." : "");
   }
 
   async send() {
