@@ -44,4 +44,4 @@ def test_a_head_from_outside_goes_through_the_bench_suite(
 ) -> None:
     pan_tilt = "{driver: 'bench_rig.head:DRIVER', options: {speed_rad_per_s: 1.5}}"
     last = bench(repository, configuration(tmp_path, pan_tilt), installed)
-    assert "12 passed" in last and "failed" not in last, last
+    assert "11 passed, 1 skipped" in last, f"{last}; the driver's own limits are not stated"

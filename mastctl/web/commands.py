@@ -11,12 +11,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from inspect import Parameter
+from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast
 
 from fastapi import Depends, FastAPI, Header, Request
 from fastapi.requests import HTTPConnection
+from fastapi.responses import FileResponse
 from pydantic import BaseModel, ConfigDict
 
+from mastctl.as_json import readable
 from mastctl.control.entry import Answer, Command, CommandRequest
 from mastctl.control.lease import Caller
 from mastctl.errors import Unable
@@ -73,6 +76,12 @@ def file_of(*kinds: str, **others: Any) -> dict[int | str, dict[str, Any]]:
     """Describe a route whose answer is a file of one of these media types."""
     form = {"type": "string", "format": "binary"}
     return {200: {"content": {kind: {"schema": form} for kind in kinds}, **others}}
+
+
+def whole_file(path: Path, request: Request) -> FileResponse:
+    """Answer with a whole file, whatever part of it is requested."""
+    request.scope["headers"] = [one for one in request.scope["headers"] if one[0] != b"range"]
+    return FileResponse(path, media_type="application/octet-stream", filename=readable(path.name))
 
 
 async def _commanded(

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import FastAPI, Path
+from fastapi import FastAPI, Path, Request
 from fastapi.responses import FileResponse, Response
 from pydantic import Field, model_validator
 
 from mastctl import answers
-from mastctl.as_json import readable
 from mastctl.bench.runs import NAME
 from mastctl.control.entry import Command
 from mastctl.http import PREFIX
 from mastctl.motion.requests import Angle, Name, StrictBody
 from mastctl.service.masts import MastInUse, Masts
-from mastctl.web.commands import Here, command, file_of
+from mastctl.web.commands import Here, command, file_of, whole_file
 
 REPORT = (
     "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox; base-uri 'none'; "
@@ -152,9 +151,8 @@ def add_recordings(app: FastAPI) -> None:
         response_class=FileResponse,
         responses=file_of("application/octet-stream"),
     )
-    async def read(name: str, file: str, here: Here) -> FileResponse:
-        path = await here.waiting.run(lambda: here.service.recorder.file(name, file))
-        return FileResponse(path, media_type="application/octet-stream", filename=readable(path.name))
+    async def read(name: str, file: str, request: Request, here: Here) -> FileResponse:
+        return whole_file(await here.waiting.run(lambda: here.service.recorder.file(name, file)), request)
 
     @command(app, "DELETE /recordings/{name}", Command("record.delete", "admin"))
     def delete(name: str, here: Here) -> answers.RecordingDeleted:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from fastapi import FastAPI, Path
+from fastapi import FastAPI, Path, Request
 from fastapi.responses import FileResponse, Response
 from pydantic import Field, model_validator
 
@@ -14,7 +14,7 @@ from mastctl.http import PREFIX
 from mastctl.motion.requests import Angle, Name, Place, StrictBody
 from mastctl.panorama.folder import Index
 from mastctl.service.steering import usual_s
-from mastctl.web.commands import Here, command, file_of
+from mastctl.web.commands import Here, command, file_of, whole_file
 from mastctl.web.keeping import PlaceName
 
 Panorama = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]{0,60}$", description="a panorama's id")]
@@ -118,9 +118,8 @@ def add_panoramas(app: FastAPI) -> None:
         response_class=FileResponse,
         responses=file_of("application/octet-stream"),
     )
-    async def read(name: Panorama, file: str, here: Here) -> FileResponse:
-        path = await here.waiting.run(lambda: here.service.panoramas.file(name, file))
-        return FileResponse(path, media_type="application/octet-stream", filename=path.name)
+    async def read(name: Panorama, file: str, request: Request, here: Here) -> FileResponse:
+        return whole_file(await here.waiting.run(lambda: here.service.panoramas.file(name, file)), request)
 
 
 def add_targets(app: FastAPI) -> None:
