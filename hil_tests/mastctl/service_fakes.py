@@ -26,6 +26,7 @@ from hil_tests.waiting import NET_S
 from mastctl.answers import Step
 from mastctl.client import Client
 from mastctl.config import load_config
+from mastctl.control.publisher import Publisher, Topic
 from mastctl.drift.journal import JournalThread
 
 if TYPE_CHECKING:
@@ -174,6 +175,12 @@ class Hang:
 
     def let_go(self) -> None:
         self._go.set()
+
+
+def newest(publisher: Publisher, topic: Topic, key: str) -> Any:
+    """The newest value of a key, None before the first."""
+    with publisher.subscribe(topic) as heard:
+        return next((one.value for one in heard.wait(0.0) if one.key == key), None)
 
 
 def on_disk(thread: JournalThread) -> None:

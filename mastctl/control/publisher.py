@@ -176,11 +176,6 @@ class Publisher:
             for subscription in self._subscriptions:
                 subscription.forget(topic, key)
 
-    def newest(self, topic: Topic, key: str) -> Any:
-        """Return the newest value of a key, None before the first; takes no lock."""
-        known = self._newest.get((topic, key))
-        return None if known is None else known.value
-
     def subscribe(self, *topics: Topic) -> ThreadSubscription:
         """Return a subscription for a thread, without topics to all; it begins with what is known already."""
         subscription = ThreadSubscription(self, topics)

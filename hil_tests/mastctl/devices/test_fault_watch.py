@@ -8,7 +8,7 @@ import pytest
 
 from drivers.errors import NoReply
 from hil_tests.mastctl.devices.turned import Hang, Turned
-from hil_tests.mastctl.service_fakes import FakeHardware, rig
+from hil_tests.mastctl.service_fakes import FakeHardware, newest, rig
 from mastctl.control.machine import StateMachine
 from mastctl.devices.cameras import HEAD
 from mastctl.devices.devices import Devices
@@ -99,5 +99,5 @@ def test_a_fault_of_a_camera_is_published_and_changes_no_state(
         frame = devices.frames(["navcam_left"], 0.0, 1.0)["navcam_left"]
         (facts,) = [one for one in clock.until(lambda: heard.wait(0), "the facts") if one.topic == "frame"]
         assert facts.value.frame_id == frame.frame_id and not hasattr(facts.value, "image")
-        clock.until(lambda: machine.publisher.newest("fault", "navcam_left") == (), "its end")
+        clock.until(lambda: newest(machine.publisher, "fault", "navcam_left") == (), "its end")
     assert machine.standing.state == "ready"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hil_tests.mastctl.service_fakes import fake_daemon, on_disk
+from hil_tests.mastctl.service_fakes import fake_daemon, newest, on_disk
 from hil_tests.waiting import until
 from mastctl.client import Client
 from mastctl.control.machine import StandingFault
@@ -42,10 +42,10 @@ def test_each_own_fault_is_published_and_in_the_status(
         publisher = daemon.service.machine.publisher
         with monkeypatch.context() as patch:
             patch.setattr(getattr(daemon.service, part), "faults", lambda: (FULL,))
-            until(lambda: publisher.newest("fault", "a file") == (FULL,), "the fault")
+            until(lambda: newest(publisher, "fault", "a file") == (FULL,), "the fault")
             assert ("a file", "full") in [(one["device"], one["code"]) for one in client.status()["faults"]]
             assert client.status()["state"] != "fault", "the head is well"
-        until(lambda: publisher.newest("fault", "a file") == (), "the fault's end")
+        until(lambda: newest(publisher, "fault", "a file") == (), "the fault's end")
 
 
 def test_the_drift_watch_begins_when_all_that_it_reads_is_there(
