@@ -19,14 +19,7 @@ from calib.errors import CalibError, Unreachable
 from calib.geometry.rigid import Rigid
 from calib.plan.knowledge import BenchShot, BoardView, ExpectedPointing, Knowledge, Workspace, pointing
 from calib.plan.placements import FEWEST, body_cameras
-from calib.plan.poses import (
-    AttitudeChoice,
-    Sought,
-    expected_px,
-    readings,
-    rover_from_board,
-    with_board,
-)
+from calib.plan.poses import AttitudeChoice, Sought, expected_px, readings, rover_from_board, with_board
 from calib.survey.records import Survey
 from calib.survey.writer import BenchFolder
 from calib.targets.boards import AnyBoard

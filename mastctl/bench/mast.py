@@ -88,8 +88,6 @@ class BenchInterrupted(MastctlError):
 class NoLight(BenchInterrupted):
     """Every camera's image at an attitude is too dark, or too bright, to be used; elsewhere it may do."""
 
-    code = "interrupted"
-
 
 @dataclass(frozen=True, eq=False)
 class SeenBoard:

@@ -26,16 +26,7 @@ from calib.errors import BadFile
 from calib.files import replace_bytes
 from drivers.errors import DriverError
 from mastctl.answers import BenchRunRecord, BenchRuns
-from mastctl.bench.runs import (
-    HOLDER,
-    SHOWN,
-    BenchJob,
-    RunFiles,
-    Runs,
-    board_bytes,
-    known_boards,
-    new_record,
-)
+from mastctl.bench.runs import HOLDER, SHOWN, BenchJob, RunFiles, Runs, board_bytes, known_boards, new_record
 from mastctl.control.lease import Caller, Lease, LeaseTable, StopCame
 from mastctl.control.publisher import Publisher
 from mastctl.errors import BadRequest, MastctlError, NotNow, Unable

@@ -25,14 +25,7 @@ from calib.plan.placements import Advice, Placement, advise, advise_for_body, fi
 from calib.plan.poses import AttitudeChoice, candidates, next_shot
 from calib.targets.boards import Corners
 from mastctl.bench.known import BenchKnowledge
-from mastctl.bench.mast import (
-    BenchInterrupted,
-    BenchLook,
-    BenchMast,
-    NotThere,
-    SimulatedBoard,
-    find_board,
-)
+from mastctl.bench.mast import BenchInterrupted, BenchLook, BenchMast, NotThere, SimulatedBoard, find_board
 from mastctl.errors import MastctlError
 from mastctl.report.pages import Table
 
@@ -265,7 +258,7 @@ class BenchRun:
         self._reporter.change(step="fit")
         known.believe_boards()
         known.try_fit()
-        self._report(None)
+        self._reporter.change(**known.progress(self._target_px()))
         name = known.placements()[-1]
         if self._stands_still(name):
             self._reporter.say(f"the board stands as it stood in placement {name}")
@@ -328,7 +321,7 @@ class BenchRun:
             choice = next_shot(known.now, known.sought, known.shots, name, known.aim, in_vain, ahead)
             if choice is None or taken >= most or self._suffices(taken, choice):
                 break
-            self._report(choice)
+            self._reporter.change(**known.progress(self._target_px(), choice))
             shot = choice.shot
             look = self.look_at(shot)
             if look is not None and look.found:
@@ -384,9 +377,6 @@ class BenchRun:
             return True
         last = len(known.placements()) >= PLACEMENTS[1]
         return choice.expected_px > (1.0 - (LAST_GAIN if last else LITTLE_GAIN)) * now_px
-
-    def _report(self, choice: AttitudeChoice | None) -> None:
-        self._reporter.change(**self.known.progress(self._target_px(), choice))
 
 
 def corners_apart_px(then: BenchLook, now: BenchLook) -> float | None:

@@ -43,7 +43,6 @@ BESIDE = 5
 """Niceness: the daemon comes first."""
 
 MOST_SENTENCES, LONGEST_SENTENCE = 40, 400
-MOST_ON_CURVE = 600
 
 
 def work(job: BenchJob, link: Connection) -> None:
@@ -85,7 +84,7 @@ class LinkReporter:
         run = {**self.run, **changed}
         if changed.get("predicted_px") is not None:
             before = [one for one in run["curve"] if one[0] < run["pictures"]]
-            run["curve"] = [*before, [float(run["pictures"]), run["predicted_px"]]][-MOST_ON_CURVE:]
+            run["curve"] = [*before, [float(run["pictures"]), run["predicted_px"]]]
         self.run = cast(BenchRunRecord, run)
         self._link.send(self.run)
 

@@ -51,7 +51,6 @@ CLOSER = 0.1
 FAR_PX = 20.0
 """The same where the image's own board has no pixels to compare with."""
 
-
 OWN = "their own sigmas"
 """What states a sigma that dots or corners came with, each its own; shown is the median."""
 

@@ -20,9 +20,7 @@ from drivers.errors import BadOptions
 from drivers.simulation_clock import MAX
 from mastctl.config import Config, Listen, load_config, not_simulated
 from mastctl.devices.frames import camera_and_sequence
-from mastctl.experiment.pointing import (
-    ClickTruth,
-)
+from mastctl.experiment.pointing import ClickTruth
 
 if TYPE_CHECKING:
     from drivers.sim.rover import RoverModel
