@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import FastAPI, Path, Request
+from fastapi import FastAPI, Path
 from fastapi.responses import FileResponse, Response
 from pydantic import Field, model_validator
 
@@ -151,8 +151,8 @@ def add_recordings(app: FastAPI) -> None:
         response_class=FileResponse,
         responses=file_of("application/octet-stream"),
     )
-    async def read(name: str, file: str, request: Request, here: Here) -> FileResponse:
-        return whole_file(await here.waiting.run(lambda: here.service.recorder.file(name, file)), request)
+    async def read(name: str, file: str, here: Here) -> FileResponse:
+        return whole_file(await here.waiting.run(lambda: here.service.recorder.file(name, file)))
 
     @command(app, "DELETE /recordings/{name}", Command("record.delete", "admin"))
     def delete(name: str, here: Here) -> answers.RecordingDeleted:

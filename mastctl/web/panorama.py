@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal, Self
 
-from fastapi import FastAPI, Path, Request
+from fastapi import FastAPI, Path
 from fastapi.responses import FileResponse, Response
 from pydantic import Field, model_validator
 
@@ -118,8 +118,8 @@ def add_panoramas(app: FastAPI) -> None:
         response_class=FileResponse,
         responses=file_of("application/octet-stream"),
     )
-    async def read(name: Panorama, file: str, request: Request, here: Here) -> FileResponse:
-        return whole_file(await here.waiting.run(lambda: here.service.panoramas.file(name, file)), request)
+    async def read(name: Panorama, file: str, here: Here) -> FileResponse:
+        return whole_file(await here.waiting.run(lambda: here.service.panoramas.file(name, file)))
 
 
 def add_targets(app: FastAPI) -> None:
