@@ -147,8 +147,8 @@ class OperationRunner:
         machine: StateMachine | None = None,
     ) -> None:
         self._mover = mover
-        self._machine = machine or StateMachine(clock)
-        self._publisher = self._machine.publisher
+        self.machine = machine or StateMachine(clock)
+        self._publisher = self.machine.publisher
         self._clock = clock
         self._time = deadlines_on(clock)
         self._changed = self._time.signal()
@@ -163,7 +163,7 @@ class OperationRunner:
     @property
     def running(self) -> str | None:
         """Id of the running operation, None when none runs."""
-        return self._machine.standing.operation
+        return self.machine.standing.operation
 
     def start(self, request: Mapping[str, Any], work: Work, on_end: OnEnd | None = None) -> Operation:
         """Start ``work(record_step, cancelled)`` in a thread and return its first record; waits for nothing.
@@ -173,7 +173,7 @@ class OperationRunner:
         """
         with self._changed:
             name = f"{next(self._numbers):06d}-{self._run}"
-            self._machine.operation_began(name, request)
+            self.machine.operation_began(name, request)
             operation = Operation(name, "queued", dict(request), self._clock.now_s())
             self._keep(operation)
             current = self._current = _Running(name)
@@ -192,7 +192,7 @@ class OperationRunner:
     def stopping(self) -> Iterator[None]:
         """Let no operation start and no move go out inside the block; waits for nothing."""
         holder = object()
-        self._machine.stop_requested()
+        self.machine.stop_requested()
         self._mover.block_moves(holder, STOP_REQUESTED)
         try:
             yield
@@ -232,7 +232,7 @@ class OperationRunner:
             current = self._current
             if current is None or current.id != name or current.cancelled.is_set():
                 return
-            self._machine.stop_requested()
+            self.machine.stop_requested()
             self._cancel(error or Stopped(STOP_REQUESTED))
         try:
             self._mover.stop()
@@ -259,13 +259,13 @@ class OperationRunner:
     def refusal(self, need: Need) -> MastctlError | None:
         """Return the refusal of a command, as `Standing.refusal`; what was stopped may end first."""
         self.let_stopped_end()
-        return self._machine.standing.refusal(need)
+        return self.machine.standing.refusal(need)
 
     def let_stopped_end(self) -> None:
         """Wait for a stop, and for the operation that it ends; `ENDS_SOON_S` at most."""
         until_s = self._time.now_s() + ENDS_SOON_S
         with self._changed:
-            while self._machine.standing.stopping and (left_s := until_s - self._time.now_s()) > 0:
+            while self.machine.standing.stopping and (left_s := until_s - self._time.now_s()) > 0:
                 self._changed.wait(left_s)
 
     def get(self, name: str) -> Operation:
@@ -287,7 +287,7 @@ class OperationRunner:
         """
         if self._closed:
             return
-        self._machine.closing()
+        self.machine.closing()
         self._mover.block_moves(self, CLOSING)
         with self._logged("as the service closes"):
             self._mover.stop()
@@ -320,7 +320,7 @@ class OperationRunner:
             self.end(current.id, late[1])
 
     def _stop_ended(self) -> None:
-        self._machine.stop_ended()
+        self.machine.stop_ended()
         with self._changed:
             self._changed.notify_all()
 
@@ -409,7 +409,7 @@ class OperationRunner:
             if self._current is not current:
                 return  # given up before
             self._mover.allow_moves(current.id)
-            self._machine.operation_ended(residual)
+            self.machine.operation_ended(residual)
             ended_s = self._clock.now_s()  # the record last, since it is what clients wait for
             known = self._records[current.id]
             self._keep(replace(known, state=state, result=result, error=error, ended_s=ended_s))

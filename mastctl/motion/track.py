@@ -23,7 +23,6 @@ from calib.matching.track import Track, moved_track
 from drivers.clock import Clock
 from mastctl.answers import Handover, PoseAnswer, TrackAnswer, TrackState
 from mastctl.as_json import as_json
-from mastctl.control.machine import StateMachine
 from mastctl.control.operations import Operation, OperationRunner
 from mastctl.devices.devices import Devices
 from mastctl.errors import BadRequest, MastctlError, NotNow
@@ -195,9 +194,8 @@ class Tracker:
     """At most one track, and the rover's pose; safe to use from any thread, never blocks for a device.
 
     ``rig`` is the configured part of the mast file in use. ``on_matched`` gets each hand-off's record, in the
-    operation's thread; it may take its time. ``machine`` gets the begin and the end of a track, its publisher
-    each change of it. ``moved_s`` is when the newest pose that moved the rover came, seconds of
-    CLOCK_MONOTONIC; None before.
+    operation's thread; it may take its time. ``moved_s`` is when the newest pose that moved the rover came,
+    seconds of CLOCK_MONOTONIC; None before.
     """
 
     def __init__(
@@ -208,10 +206,8 @@ class Tracker:
         clock: Clock,
         settings: TrackingSettings,
         on_matched: Callable[[MatchedHandoff], None],
-        machine: StateMachine,
     ) -> None:
         self.moved_s: float | None = None
-        self._machine = machine
         self._operations = operations
         self._devices = devices
         self._rig = rig
@@ -424,9 +420,9 @@ class Tracker:
         if status.state == "lost" and (before.state, before.reason) != (status.state, status.reason):
             log.warning("track %s: %s", status.id, status.reason)
         self._status = replace(status, sequence=before.sequence + 1, changed_s=self._clock.now_s())
-        self._machine.publisher.publish("track", "track", self._status)
+        self._operations.machine.publisher.publish("track", "track", self._status)
         if (before.state in ACTIVE) != (status.state in ACTIVE):
-            self._machine.follow(status.id if status.state in ACTIVE else None)
+            self._operations.machine.follow(status.id if status.state in ACTIVE else None)
 
     # In the operation's thread
 

@@ -172,7 +172,6 @@ class Service:
             clock,
             config.tracking,
             self._handed_over,
-            machine,
         )
         self.stopping = Stopping(self.devices, self.operations, self.tracker, machine, self.latch)
         self.masts = Masts(config, mast, self.devices, self.operations, machine, self._use_mast)
