@@ -159,22 +159,6 @@ def test_nobody_shares_a_lease_by_a_key_without_a_name(web: httpx.Client, path: 
     assert web.get("/lease").json() == {"control": None}
 
 
-def test_what_a_dead_client_began_is_stopped_with_its_lease(
-    bench: Client, pair: Pair, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(ScriptedLoop, "script", staticmethod(waits))
-    granted = bench.acquire_lease(for_s=1.0)
-    bench.use_lease(granted["lease_id"])
-    operation = bench.point(**ANGLES)
-    record = bench.wait(operation, NET_S)  # nobody renews the lease
-    assert record["state"] == "stopped"
-    assert record["error"] is not None
-    assert (
-        "bench began it, and its lease has ended: the lease was not renewed for 1 s"
-        in present(record["error"])["message"]
-    )
-
-
 class Dropping:
     """A way to the daemon on which answers are lost: ``drop`` of them, after the request went through."""
 
