@@ -17,10 +17,10 @@ from calib.geometry.rigid import FloatArray, Rigid
 from calib.matching.mosaic import Picture, composed, frames_of, gains_of, seams_of, slip_of
 from mastctl.answers import PanoramaDrawn
 from mastctl.errors import BadRequest
-from mastctl.panorama.folder import MOSAIC, PREVIEW, PREVIEW_PX, Folder, MosaicRecord, write_picture
+from mastctl.panorama.folder import MOSAIC, PREVIEW, PREVIEW_PX, Folder, MosaicRecord, write_whole
+from mastctl.report.pictures import encoded
 
 GROUND = MosaicSurface("ground", 0.0)
-JPEG = {cv2.IMWRITE_JPEG_QUALITY: 85}
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ def compose(folder: Folder, wanted: Composition, between: Callable[[], None] = l
     between()
     slip = slip_of(folder.mast.rig, index.cameras[0], folder.angles_rad(), canvas, seams.patches)
     between()
-    write_picture(folder.path / MOSAIC, mosaic, {cv2.IMWRITE_PNG_COMPRESSION: 1})
-    write_picture(folder.path / PREVIEW, reduced(mosaic), JPEG)
+    write_whole(folder.path / MOSAIC, encoded(mosaic, "png"))
+    write_whole(folder.path / PREVIEW, preview(mosaic))
     numbers = [number for number, _ in index.taken()]
     numbered = [replace(one, views=tuple(numbers[at] for at in one.views)) for one in seams.by_views]
     found = {
@@ -82,14 +82,13 @@ def so_far(folder: Folder) -> bytes:
     """Return what was taken so far as a JPEG of a preview's size, composed for the default surface."""
     cameras, canvas = folder.cameras(), canvas_for(folder, SO_FAR)
     owners, places = frames_of(canvas, cameras)
-    picture = reduced(composed(folder.pictures(), owners, places))
-    return bytes(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 85])[1])
+    return preview(composed(folder.pictures(), owners, places))
 
 
-def reduced(mosaic: Picture) -> Picture:
-    """Return a mosaic at the size of a preview."""
+def preview(mosaic: Picture) -> bytes:
+    """Return a mosaic as JPEG, at most 2048 pixels wide."""
     part = min(1.0, PREVIEW_PX / mosaic.shape[1])
-    return np.asarray(cv2.resize(mosaic, None, fx=part, fy=part, interpolation=cv2.INTER_AREA), np.uint8)
+    return encoded(cv2.resize(mosaic, None, fx=part, fy=part, interpolation=cv2.INTER_AREA), "jpeg", 85)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 import struct
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from calib.errors import BadFile
@@ -17,6 +15,7 @@ from calib.geometry.mosaic import Canvas
 from calib.geometry.rigid import FloatArray
 from calib.matching.mosaic import Picture
 from mastctl.panorama.folder import write_whole
+from mastctl.report.pictures import encoded, with_text
 
 XMP = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
 <x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">
@@ -24,7 +23,6 @@ XMP = """<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?>
  GPano:UsePanoramaViewer="True" GPano:ProjectionType="{projection}"{facts}/>
 </rdf:RDF></x:xmpmeta>
 <?xpacket end="w"?>"""
-JPEG_QUALITY = 92
 FIT_STEPS, FIT_ROUNDS = 15, 6
 """Pixels across and down of which a lens is fitted, and how often its focal length is."""
 
@@ -35,9 +33,7 @@ def gpano(mosaic: Picture, canvas: Canvas, path: Path) -> None:
     The middle of the sphere is straight ahead, azimuth and elevation 0. Raises BadFile.
     """
     height, width = mosaic.shape[:2]
-    full = 4 * round(math.pi / 2.0 * canvas.px_per_rad)
-    full_height = _full_height(canvas, full // 2)
-    left, top = _corner(canvas, full, full_height)
+    full, full_height, left, top = _sphere(canvas)
     facts = {
         "FullPanoWidthPixels": full,
         "FullPanoHeightPixels": full_height,
@@ -47,22 +43,16 @@ def gpano(mosaic: Picture, canvas: Canvas, path: Path) -> None:
         "CroppedAreaTopPixels": top,
     }
     text = "".join(f'\n GPano:{name}="{value}"' for name, value in facts.items())
-    xmp = XMP.format(projection=canvas.projection, facts=text).encode()
-    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    png = path.suffix.lower() == ".png"
-    done, data = cv2.imencode(".png" if png else ".jpg", mosaic, [] if png else options)
-    if not done or path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise BadFile(path, "", "a name that ends with .jpg or .png is expected")
-    picture = data.tobytes()
-    if png:
-        chunk = b"iTXt" + b"XML:com.adobe.xmp\x00\x00\x00\x00\x00" + xmp
-        packed = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
-        at = 8 + 25  # behind the signature and IHDR
+    xmp = XMP.format(projection=canvas.projection, facts=text)
+    if path.suffix.lower() == ".png":
+        data = with_text(encoded(mosaic, "png"), {"XML:com.adobe.xmp": xmp})
+    elif path.suffix.lower() in (".jpg", ".jpeg"):
+        body = b"http://ns.adobe.com/xap/1.0/\x00" + xmp.encode()
+        picture = encoded(mosaic, "jpeg")  # two bytes start it, then come its segments
+        data = picture[:2] + b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body + picture[2:]
     else:
-        body = b"http://ns.adobe.com/xap/1.0/\x00" + xmp
-        packed = b"\xff\xe1" + struct.pack(">H", len(body) + 2) + body
-        at = 2  # behind the start of the image
-    write_whole(path, picture[:at] + packed + picture[at:])
+        raise BadFile(path, "", "a name that ends with .jpg or .png is expected")
+    write_whole(path, data)
 
 
 def hugin(cameras: Sequence[CameraModel], files: Sequence[str], canvas: Canvas, path: Path) -> float:
@@ -76,9 +66,7 @@ def hugin(cameras: Sequence[CameraModel], files: Sequence[str], canvas: Canvas, 
     names = "vabcde"
     fov = " ".join(f"{name}{value!r}" for name, value in zip(names, lens.tolist(), strict=True))
     w, h = canvas.size_px
-    whole = 4 * round(math.pi / 2.0 * canvas.px_per_rad)  # cropped to the mosaic
-    tall = _full_height(canvas, whole // 2)
-    left, top = _corner(canvas, whole, tall)
+    whole, tall, left, top = _sphere(canvas)
     field = f"w{whole} h{tall} v{math.degrees(whole / canvas.px_per_rad)!r}"
     crop = f"S{left},{left + w},{top},{top + h}"
     lines = [
@@ -97,24 +85,18 @@ def hugin(cameras: Sequence[CameraModel], files: Sequence[str], canvas: Canvas, 
     return worst_px
 
 
-def _corner(canvas: Canvas, width: int, height: int) -> tuple[int, int]:
-    """Column and row of a mosaic's top-left pixel in a picture of the sphere, 0, 0 in its middle."""
-    left = canvas.azimuth_rad * canvas.px_per_rad + (width - 1) / 2.0
-    return round(left), round((height - 1) / 2.0 - _rise_px(canvas))
+def _sphere(canvas: Canvas) -> tuple[int, int, int, int]:
+    """Width and height of the whole picture around a mosaic, column and row of its top-left pixel in that.
 
-
-def _rise_px(canvas: Canvas) -> float:
-    """How far a mosaic's first row lies above the horizon."""
-    rise = canvas.elevation_rad
-    return (math.tan(rise) if canvas.projection == "cylindrical" else rise) * canvas.px_per_rad
-
-
-def _full_height(canvas: Canvas, sphere: int) -> int:
-    """Rows of the whole picture about the horizon: of a sphere, or what a cylinder's mosaic needs."""
-    if canvas.projection == "equirectangular":
-        return sphere
-    above = _rise_px(canvas)
-    return 2 * math.ceil(max(above, canvas.size_px[1] - 1 - above) + 1.0)
+    The middle is straight ahead. Of a cylinder it is as high as the mosaic needs.
+    """
+    full, rise = 4 * round(math.pi / 2.0 * canvas.px_per_rad), canvas.elevation_rad
+    above = (math.tan(rise) if canvas.projection == "cylindrical" else rise) * canvas.px_per_rad
+    height = full // 2
+    if canvas.projection == "cylindrical":
+        height = 2 * math.ceil(max(above, canvas.size_px[1] - 1 - above) + 1.0)
+    left = canvas.azimuth_rad * canvas.px_per_rad + (full - 1) / 2.0
+    return full, height, round(left), round((height - 1) / 2.0 - above)
 
 
 def _hugin_lens(camera: CameraModel) -> tuple[FloatArray, float]:

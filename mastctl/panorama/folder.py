@@ -11,7 +11,7 @@ a daemon keeps beside it is in the folder, so it opens anywhere.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import fields
 from functools import lru_cache
 from pathlib import Path
@@ -24,6 +24,7 @@ from pydantic import Field
 from calib.errors import BadFile
 from calib.files import digest_of, read_bytes, replace_bytes, write_new
 from calib.files.mast_file import CameraName, StoredRig, load_rig
+from calib.files.pictures import decode_picture
 from calib.files.records import ABSENT, Moment, Number, Pair, Record, Text, Vector, parse_record
 from calib.files.yaml_text import dump_mapping
 from calib.geometry.cahvor import CameraModel
@@ -33,6 +34,7 @@ from calib.matching.mosaic import Picture, SeamError, Slip
 from mastctl.as_json import as_json
 from mastctl.devices.frames import StampedFrame
 from mastctl.frame_facts import FrameFacts
+from mastctl.report.pictures import encoded
 
 SCHEMA: Literal["mastctl/panorama/1"] = "mastctl/panorama/1"
 INDEX, MAST, MOSAIC, PREVIEW = "index.yaml", "mast.yaml", "mosaic.png", "preview.jpg"
@@ -154,7 +156,7 @@ class Folder:
     def keep(self, number: int, camera: str, frame: StampedFrame) -> FrameRecord:
         """Write a picture of a view and return its record. Raises BadFile; nothing is left then."""
         file = f"frames/{number:03d}-{camera}.png"
-        data = cv2.imencode(".png", frame.image, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].tobytes()
+        data = encoded(frame.image, "png")
         write_whole(self.path / file, data)
         return FrameRecord(file=file, sha256=digest_of(data), facts=frame.facts)
 
@@ -200,12 +202,6 @@ class Folder:
         return lru_cache(PICTURES_KEPT)(lambda at: self.picture(frames[at]))
 
 
-def write_picture(path: Path, picture: Picture, options: Mapping[int, int] | None = None) -> None:
-    """Write a picture by its suffix, whole or not at all. Raises BadFile."""
-    flat = [number for pair in (options or {}).items() for number in pair]
-    write_whole(path, cv2.imencode(path.suffix, picture, flat)[1].tobytes())
-
-
 def write_whole(path: Path, data: bytes) -> None:
     """Write a file whole or not at all. Raises BadFile."""
     try:
@@ -215,10 +211,10 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def _decoded(path: Path, data: bytes) -> Picture:
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise BadFile(path, "", "is no picture")
-    return np.asarray(image, dtype=np.uint8)
+    try:
+        return np.asarray(decode_picture(data, cv2.IMREAD_UNCHANGED), dtype=np.uint8)
+    except ValueError as error:
+        raise BadFile(path, "", str(error)) from None
 
 
 def _save(path: Path, index: Index) -> None:

@@ -363,7 +363,7 @@ def test_the_command_brings_the_folder_shows_composes_exports_and_points(
     assert b"GPano:ProjectionType" in sphere.read_bytes()
     (out / "mosaic.png").write_bytes(b"no picture")
     assert main(["panorama", "export", str(out), "--gpano", str(sphere)]) == 2
-    assert "mosaic.png: is no picture" in capsys.readouterr().err
+    assert "mosaic.png: a PNG or JPEG file is expected" in capsys.readouterr().err
     damaged = out / index["views"][0]["frames"]["navcam_left"]["file"]
     damaged.write_bytes(b"no picture")
     assert main(["panorama", "take", "--resume", str(out), *url]) == 0
