@@ -95,7 +95,7 @@ class BenchFolder:
                 continue
             if place not in before or place not in now or before[place] != now[place]:
                 was, wanted = (repr(one[place]) if place in one else "missing" for one in (before, now))
-                reason = f"is {was}, now it would be {wanted}; another folder (--survey) is expected"
+                reason = f"is {was}, now it would be {wanted}; another folder is expected"
                 raise BadFile(file, place, reason)
         self._images = list(stored.images)
         self._corners = dict(stored.corners)
