@@ -375,7 +375,7 @@ class Windows:
         """Return that of the window with the strongest; None with too few samples."""
         found: Evidence | None = None
         window: list[Judged] = []
-        every, sure = np.zeros((1, 1)), np.zeros((1, 1))
+        every = sure = _gram(self.judged[:1]) * 0.0
         for _, span in groupby(sorted(self.judged, key=_span, reverse=True), _span):
             these = list(span)
             window += these
@@ -404,7 +404,7 @@ def _span(one: Judged) -> int:
 def _gram(those: list[Judged]) -> FloatArray:
     """The sum of rowsᵀ rows."""
     if not those:
-        return np.zeros((1, 1))
+        return np.zeros(())
     rows = np.concatenate([one.rows for one in those])
     return np.asarray(rows.T @ rows)
 

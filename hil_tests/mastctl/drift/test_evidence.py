@@ -104,14 +104,19 @@ def test_one_false_match_is_no_drift() -> None:
 
 
 def test_unconfirmed_false_matches_are_no_drift_and_a_bump_is_one() -> None:
+    """The bump also where no pointing at all is confirmed any more."""
     stored = stored_rig()
-    for what, turn_rad, expected in (("false", 0.0, "good"), ("bump", BUMP_RAD, "drifts")):
+    for what, turn_rad, expected in (
+        ("false", 0.0, "good"),
+        ("bump", BUMP_RAD, "drifts"),
+        ("all fail", BUMP_RAD, "drifts"),
+    ):
         rng = np.random.default_rng(6)
         true = bumped(honest(stored.rig, rng), "pancam_left", (0.0, turn_rad, 0.0))
         windows = Windows(stored)
         for number in range(12):
             one = pointing(stored, true, rng, NOON_S + number)
-            if number % 2:
+            if number % 2 or what == "all fail":
                 off = rng.uniform(-48.0, 48.0, 2).tolist() if what == "false" else one["off_px"]
                 one = {**one, "confirmed": False, "off_px": off}
             windows.add(one)
