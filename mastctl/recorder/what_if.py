@@ -36,6 +36,8 @@ STEP_RAD = 1e-6
 LEAST_PX = 0.02
 """No match is known better than this, whatever it says."""
 
+NO_PAIR = "it pointed with one camera, and no pair saw the target"
+BY_DIRECTION = "it pointed in the direction of a panorama's pixel, and compared no images"
 WITHOUT_TARGET = {
     "panorama": "it took a panorama, in which no target was chosen",
     "position_m": "it pointed at a position, and no image shows which pixel that is",
@@ -124,8 +126,14 @@ def seen_in(
     for name, record in operations.items():
         request = record.get("request") or {}
         if "pixel" not in request:
-            if reason := next((WITHOUT_TARGET[key] for key in WITHOUT_TARGET if request.get(key)), ""):
+            reason = next((WITHOUT_TARGET[key] for key in WITHOUT_TARGET if key in request), "")
+            if isinstance(request.get("panorama"), Mapping):
+                reason = BY_DIRECTION
+            if reason:
                 others[name] = reason
+            continue
+        if record.get("pointings") and record.get("range_from", "stereo") not in ("", "stereo"):
+            others[name] = NO_PAIR
             continue
         try:
             pointings = _pointings(name, record, frames)

@@ -141,13 +141,20 @@ def test_what_cannot_be_worked_out_is_named() -> None:
         "2": {"state": "failed", "request": {"pixel": {"camera": "a"}}, "error": {"message": "it was flat"}},
         "3": {"state": "done", "request": {"pixel": {"camera": "a"}}, "pointings": [{"target_px": [1, 2]}]},
         "4": {"state": "done", "request": {"pan_rad": [-1.0, 1.0], "panorama": "p"}, "pointings": []},
-        "5": {"state": "done", "request": {"pan_rad": 0.1, "tilt_rad": 0.0}, "pointings": [{}]},
-    }
+        "5": {"state": "done", "request": {"pan_rad": 0.0, "tilt_rad": 0.0}, "pointings": [{}]},
+        "6": {"state": "done", "request": {"panorama": {"id": "p", "by_direction": True}}, "pointings": [{}]},
+        "7": {
+            "state": "done", "request": {"pixel": {"camera": "a"}, "range_m": 4.0}, "range_from": "given",
+            "pointings": [{"target_px": [1, 2]}],
+        },
+    }  # fmt: skip
     seen, others = seen_in(records, {})
     assert seen == []
     assert others["1"] == "it pointed at a position, and no image shows which pixel that is"
     assert others["4"] == "it took a panorama, in which no target was chosen"
     assert others["5"] == "it turned the head to angles, without a target"
+    assert others["6"] == "it pointed in the direction of a panorama's pixel, and compared no images"
+    assert others["7"] == "it pointed with one camera, and no pair saw the target"
     assert others["2"] == "it failed: it was flat"
     assert others["3"].startswith("its record does not hold enough")
 
