@@ -247,8 +247,9 @@ class StateMachine:
 
         def change(now: Standing) -> Standing:
             dropped = now.dropped
-            if now.faults and not faults and now.operation is None and now.track is None:
-                dropped = dropped or f"it is over: {now.faults[0].message}; the next command starts"
+            free = not (now.operation or now.track or now.stops) and dropped in ("", AFTER_A_STOP)
+            if now.faults and not faults and free:  # the head came to rest by itself if the stop failed
+                dropped = f"it is over: {now.faults[0].message}; the next command starts"
             return replace(now, faults=faults, dropped=dropped)
 
         self._change(change)

@@ -172,6 +172,20 @@ def test_a_fault_that_is_over_leaves_a_head_that_holds_and_says_so() -> None:
     assert machine.standing.state == "ready"
 
 
+def test_a_head_that_rests_after_a_failed_stop_was_not_stopped() -> None:
+    machine, _, _ = machine_in("ready")
+    machine.stop_requested()
+    machine.head_faults((SILENT,))
+    machine.stop_ended()
+    machine.head_faults(())
+    assert machine.standing.reason == "it is over: the head is silent; the next command starts"
+    machine.head_faults((SILENT,))
+    machine.stop_requested()
+    machine.head_faults(())  # since this one was confirmed
+    machine.stop_ended()
+    assert machine.standing.reason == "a stop dropped the goal; the next command starts"
+
+
 def test_an_operation_that_lives_through_a_fault_goes_on() -> None:
     machine, _, _ = machine_in("moving")
     machine.head_faults((SILENT,))
