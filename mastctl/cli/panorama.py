@@ -158,10 +158,13 @@ def _export(args: argparse.Namespace) -> Answer:
 def _targets(args: argparse.Namespace) -> Answer:
     from calib.files.tables import write_rows
 
+    if args.out is not None:
+        if args.out.suffix.lower() not in (".csv", ".json", ".geojson"):
+            raise WrongUse(f"--out: {args.out} where a file ending in .csv, .json or .geojson is expected")
+        check_file(args.out, "--out")
     with client_of(args) as client:
         found = client.targets()
     if args.out is not None:
-        check_file(args.out, "--out")
         with args.out.open("w", encoding="utf-8") as file:
             if args.out.suffix.lower() == ".csv":
                 rows = [

@@ -384,5 +384,6 @@ def _granted(here: Parts, lease: Lease) -> answers.LeaseGranted:
 def _lease_of(here: Parts) -> str:
     """The lease that a request speaks of. Raises BadRequest."""
     if here.requested.lease is None:
-        raise BadRequest("bad_request", "Mastctl-Lease is missing; the id of the lease is expected")
+        sentence = "no lease is named; its id is expected, by the header Mastctl-Lease or --lease"
+        raise BadRequest("bad_request", sentence)
     return here.requested.lease

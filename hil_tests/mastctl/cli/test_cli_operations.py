@@ -82,6 +82,7 @@ def test_a_lease_is_taken_used_shown_and_released(run: Run) -> None:
     code, out, _ = run("point", *ANGLES, "--json")
     assert (code, json.loads(out)["error"]["code"]) == (1, "leased")
     assert run("point", *ANGLES, "--lease", lease, "--json")[0] == 0
+    assert "Mastctl-Lease or --lease" in run("rig", "lease", "release")[2]
     assert run("rig", "lease", "release", "--lease", lease)[:2] == (0, "released")
     code, out, _ = run("rig", "lease", "release", "--lease", lease, "--json")
     assert (code, json.loads(out)["error"]["code"]) == (1, "lease_over")

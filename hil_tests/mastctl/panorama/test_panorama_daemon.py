@@ -380,6 +380,7 @@ def test_the_command_brings_the_folder_shows_composes_exports_and_points(
     np.testing.assert_allclose([pixel["x_px"], pixel["y_px"]], clicked, atol=1e-6)
     kept = str(tmp_path / "targets")
     assert main(["panorama", "keep", "stone", "--operation", record["id"], *url]) == 0
+    assert main(["panorama", "targets", "--out", f"{kept}.txt", *url]) == 2
     assert main(["panorama", "targets", "--out", f"{kept}.csv", *url]) == 0
     assert main(["panorama", "targets", "--out", f"{kept}.json", *url]) == 0
     header, row = Path(f"{kept}.csv").read_text().splitlines()
