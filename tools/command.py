@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike
 from calib.errors import CalibError
 from drivers.errors import DriverError
 from mastctl import signals
-from mastctl.cli.experiment import TASKS
-from mastctl.cli.options import add_options, at_least
+from mastctl.cli.experiment import run_bar
+from mastctl.cli.options import at_least
 from mastctl.cli.output import CommandError, WrongUse, as_command_error, one_line
 from mastctl.errors import MastctlError
 
@@ -78,8 +78,34 @@ def options(
     if as_json:
         parser.add_argument("--json", action="store_true", help="one JSON document")
     if tasks:
-        add_options(parser, *TASKS)
+        where = "local: this machine's processes; dask:ADDRESS (default local)"
+        parser.add_argument("--executor", default="local", metavar="WHERE", help=where)
+        processes = "local processes (default: one a processor)"
+        parser.add_argument("--workers", type=at_least(1), metavar="N", help=processes)
     return parser
+
+
+def results_of(
+    args: argparse.Namespace,
+    name: str,
+    function: Callable[[Task], Result],
+    tasks: Sequence[Task],
+    label: Callable[[Task], str] = str,
+    failure: Callable[[Result], str] = lambda _: "",
+) -> list[Result]:
+    """Run tasks as a campaign's options say, with a progress bar of this ``name`` on stderr.
+
+    ``failure`` returns why a result is a failure, which is shown as it comes, or an empty text. The rest as
+    `mastctl.experiment.tasks.run_tasks`.
+    """
+    from mastctl.experiment.tasks import open_executor, run_tasks
+
+    def ended(task: Task, result: Result) -> None:
+        reason = failure(result)
+        step("", reason and f"{label(task)}: {reason}")
+
+    with run_bar(args, name, len(tasks)) as step, open_executor(args.executor, args.workers) as executor:
+        return run_tasks(executor, function, tasks, label, ended)
 
 
 def show(args: argparse.Namespace, rows: Iterable[Row], columns: Mapping[str, str], below: str = "") -> None:

@@ -18,13 +18,6 @@ USUAL_MM = 25.0
 """Of squares on A4; on other papers in proportion."""
 
 DICTIONARIES = ("DICT_5X5_100", "DICT_5X5_250", "DICT_5X5_1000")
-OPTIONS_OF = {
-    "charuco": ("square_mm", "marker_mm", "dictionary", "first_id"),
-    "checkerboard": ("square_mm",),
-    "aprilgrid": ("tag_mm", "gap_mm", "family", "first_id"),
-    "dots": ("spacing_mm", "dot_mm"),
-}
-"""The options of each kind of board beside rows and columns."""
 
 
 @command(
@@ -148,42 +141,38 @@ def _board(args: argparse.Namespace, paper_mm: tuple[float, float]) -> AnyBoard:
     from calib.targets.board_file import board_of, dictionary_size
     from mastctl.setup.board_sheet import largest_mm
 
-    for name in sorted({name for names in OPTIONS_OF.values() for name in names}):
-        if getattr(args, name) is not None and name not in OPTIONS_OF[args.kind]:
-            known = ", ".join(f"--{one.replace('_', '-')}" for one in OPTIONS_OF[args.kind])
-            given = f"--{name.replace('_', '-')}"
-            raise WrongUse(f"{given} is not for a board of kind {args.kind}; its options are {known}")
     wide_mm, high_mm = largest_mm(paper_mm)
     usual_mm = USUAL_MM * min(wide_mm, high_mm) / 174.0
     usual_mm = max(1.0, float(round(usual_mm / 5.0) * 5.0 if usual_mm > 10 else round(usual_mm)))
-    # What one more column takes; what the first and the last need beside that; the sizes in the file.
+    names = {f"{name}_m": f"{name}_mm" for name in ("square", "marker", "tag", "gap", "spacing")}
+    names |= {"dot_diameter_m": "dot_mm"}
+    sizes_mm = {key: size for key, name in names.items() if (size := getattr(args, name)) is not None}
+    # ``step`` is what one more column takes, ``edge`` what the first and the last need beside that.
     if args.kind in ("charuco", "checkerboard"):
-        step, edge = args.square_mm or usual_mm, 0.0
-        sizes = {"square_m": step}
+        step, edge = sizes_mm.setdefault("square_m", usual_mm), 0.0
         if args.kind == "charuco":
-            sizes["marker_m"] = args.marker_mm or 0.75 * step
+            sizes_mm.setdefault("marker_m", 0.75 * step)
     elif args.kind == "aprilgrid":
-        tag = args.tag_mm or round(1.1 * usual_mm)
-        edge = args.gap_mm or 0.3 * tag
-        step, sizes = tag + edge, {"tag_m": tag, "gap_m": edge}
+        tag = sizes_mm.setdefault("tag_m", round(1.1 * usual_mm))
+        edge = sizes_mm.setdefault("gap_m", 0.3 * tag)
+        step = tag + edge
     else:
-        step = args.spacing_mm or round(0.8 * usual_mm)
-        dot = args.dot_mm or 0.5 * step
-        edge, sizes = dot - step, {"spacing_m": step, "dot_diameter_m": dot}
+        step = sizes_mm.setdefault("spacing_m", round(0.8 * usual_mm))
+        edge = sizes_mm.setdefault("dot_diameter_m", 0.5 * step) - step
     columns, rows = args.columns or int((wide_mm - edge) / step), args.rows or int((high_mm - edge) / step)
     document: dict[str, Any] = {"kind": args.kind, "columns": columns, "rows": rows}
-    document |= {key: round(size_mm / 1000, 6) for key, size_mm in sizes.items()}
+    document |= {key: round(size_mm / 1000, 6) for key, size_mm in sizes_mm.items()}
+    given = {name: getattr(args, name) for name in ("dictionary", "family", "first_id")}
+    document |= {name: value for name, value in given.items() if value is not None}
     if args.kind == "charuco":
         enough = (name for name in DICTIONARIES if dictionary_size(name) >= columns * rows // 2)
-        document["dictionary"] = args.dictionary or next(enough, DICTIONARIES[-1])
+        document.setdefault("dictionary", next(enough, DICTIONARIES[-1]))
     elif args.kind == "aprilgrid":
-        document["family"] = args.family or "tag36h11"
-    if args.first_id is not None:
-        document["first_id"] = args.first_id
+        document.setdefault("family", "tag36h11")
     try:
         return board_of(args.out, "", document)
     except BadFile as error:
-        raise WrongUse(f"the board's {error.place}: {error.reason}") from None
+        raise WrongUse(f"a board of kind {args.kind}, {error.place}: {error.reason}") from None
 
 
 def _check_free(yaml: Path) -> None:

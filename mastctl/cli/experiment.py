@@ -8,11 +8,11 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import mastctl
 from mastctl.cli import output
@@ -25,22 +25,12 @@ if TYPE_CHECKING:
     from mastctl.client import Client
     from mastctl.experiment.pointing import ClickTruth, TargetRecord
 
-Task = TypeVar("Task")
-Result = TypeVar("Result")
-
 STUDIES = {
     "handoff": "hand targets over from Pancam to Navcam to Hazcam and measure the errors",
     "approach": "follow a rock from 10 m to 1 m on the simulated rover, beside the paper's Table I",
     "calibration": "simulated surveys of several sizes, beside the paper's Tables IV and V",
 }
 """Experiments that are ``tools.studies.NAME`` in a checkout; their own ``--help`` has their options."""
-
-
-TASKS = (
-    option("--executor WHERE", "local: this machine's processes; dask:ADDRESS", default="local"),
-    option("--workers N", "local processes (default: one a processor)"),
-)
-"""Options of a campaign or study whose cases are tasks: `results_of`."""
 
 TARGETS = (
     option("--targets N", "targets at each distance", default=3),
@@ -158,29 +148,6 @@ def _run(
     )
     document = experiment.as_json() | ({} if page is None else {"report": str(page)})
     return Answer(document, shown, 0 if any(record.landings for record in experiment.records) else 1)
-
-
-def results_of(
-    args: argparse.Namespace,
-    name: str,
-    function: Callable[[Task], Result],
-    tasks: Sequence[Task],
-    label: Callable[[Task], str] = str,
-    failure: Callable[[Result], str] = lambda _: "",
-) -> list[Result]:
-    """Run a command's tasks as its options say, with a progress bar of this ``name`` on stderr.
-
-    ``failure`` returns why a result is a failure, which is shown as it comes, or an empty text. The rest as
-    `mastctl.experiment.tasks.run_tasks`.
-    """
-    from mastctl.experiment.tasks import open_executor, run_tasks
-
-    def ended(task: Task, result: Result) -> None:
-        reason = failure(result)
-        step("", reason and f"{label(task)}: {reason}")
-
-    with run_bar(args, name, len(tasks)) as step, open_executor(args.executor, args.workers) as executor:
-        return run_tasks(executor, function, tasks, label, ended)
 
 
 @contextmanager

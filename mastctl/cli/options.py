@@ -61,11 +61,16 @@ def at_least(least: int) -> Callable[[str], int]:
     return read
 
 
-def path(text: str) -> Path:
-    """Read a value as a path; an empty one (a variable that is not set) would be the current folder."""
+def not_empty(text: str) -> str:
+    """Read a value as a name (argparse ``type``); an empty one (a variable that is not set) is refused."""
     if not text.strip():
-        raise argparse.ArgumentTypeError("the name is empty, a path is expected ('.' is the current folder)")
-    return Path(text)
+        raise argparse.ArgumentTypeError("the name is empty ('.' is the current folder)")
+    return text
+
+
+def path(text: str) -> Path:
+    """Read a value as a path (argparse ``type``)."""
+    return Path(not_empty(text))
 
 
 ANY_NUMBER = ("RAD", "X", "Y", "Z", "U", "V", "NX", "NY", "NZ", "QW", "QX", "QY", "QZ", "LOW", "HIGH")

@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from mastctl.cli import output
-from mastctl.cli.options import at_least, command, one_of, option, positive_number
+from mastctl.cli.options import at_least, command, not_empty, one_of, option, positive_number
 from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, check_folder
 
 if TYPE_CHECKING:
@@ -25,20 +25,13 @@ MARKS = {"good": "✓", "unsure": "?", "bad": "✗"}
 TWIN = "no head and no camera is plugged in: this is the simulated twin, which runs"
 
 
-def _port(text: str) -> str:
-    """Read a line's name; an empty one (a variable that is not set) would be the current folder."""
-    if not text.strip():
-        raise argparse.ArgumentTypeError("the name is empty, a device or URL is expected")
-    return text
-
-
 @command(
     "rig new",
     option("FOLDER", "where the files go"),
     option(
         "--port PORT",
         "query this line only, a device or URL; may be repeated (default: all USB adapters)",
-        type=_port,
+        type=not_empty,
         repeat=True,
     ),
     option("--pan-id ID", "the servo that turns pan", type=at_least(0)),

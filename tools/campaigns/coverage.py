@@ -51,10 +51,9 @@ from hil_tests.support.sim_survey.noise import with_uneven_noise
 from hil_tests.support.sim_survey.plan import SurveyPlan, SurveyTruth
 from hil_tests.support.sim_survey.survey import simulate_survey
 from mastctl.calibration.run import FITS, Method
-from mastctl.cli.experiment import results_of
 from mastctl.cli.options import at_least, not_negative
 from mastctl.packaged import config_folder
-from tools.command import end, held_percent, options, rms
+from tools.command import end, held_percent, options, results_of, rms
 
 Z = 1.959964
 """95 % of a normal distribution lie within so many sigmas."""

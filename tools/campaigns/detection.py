@@ -23,8 +23,7 @@ from scipy.spatial.transform import Rotation
 from calib.targets.boards import AnyBoard, AprilGrid, Charuco, Checkerboard, CornersNotFound, DotBoard
 from calib.targets.corners import find_corners
 from calib.targets.pattern import pattern_of
-from mastctl.cli.experiment import results_of
-from tools.command import end, options, rms, show
+from tools.command import end, options, results_of, rms, show
 
 FloatArray = NDArray[np.float64]
 Float32 = NDArray[np.float32]

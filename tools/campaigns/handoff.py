@@ -39,11 +39,10 @@ from drivers.sim import scene as site
 from drivers.sim.placed import SceneSettings
 from drivers.sim.rocks import make_brick, meshes, together
 from drivers.sim.scene import Scene, build_scene, sun_direction
-from mastctl.cli.experiment import results_of
 from mastctl.cli.options import at_least
 from mastctl.experiment.targets import BORDER_PX, texture_mask
 from mastctl.packaged import config_folder
-from tools.command import end, options, rms, show
+from tools.command import end, options, results_of, rms, show
 from tools.studies.approach_world import ApproachWorld, WorldErrors
 
 Float64 = NDArray[np.float64]

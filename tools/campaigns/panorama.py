@@ -20,14 +20,13 @@ import numpy as np
 
 from calib.geometry.rigid import FloatArray
 from drivers.sim.rover import RoverModel
-from mastctl.cli.experiment import results_of
 from mastctl.client import Client
 from mastctl.daemon import RunningDaemon
 from mastctl.errors import MastctlError
 from mastctl.panorama.compose import picture_at
 from mastctl.panorama.folder import Folder
 from tools.campaigns.residuals import FAR_M, LEFT, NEAR_M, RIGHT, TrueClick, config_of, hit, shown, summary
-from tools.command import end, options, show
+from tools.command import end, options, results_of, show
 
 Angles = dict[int, tuple[float, float]]
 A_SCENE = 20

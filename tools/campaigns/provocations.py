@@ -60,13 +60,12 @@ from mastctl.bench.operation import carry_out
 from mastctl.bench.runs import BenchJob
 from mastctl.calibration.run import SurveyRefused, checked_survey
 from mastctl.calibration.verdict import judge
-from mastctl.cli.experiment import results_of
 from mastctl.client import Client, Snapshot
 from mastctl.config import Listen, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.packaged import config_folder
 from tools.campaigns.provoked import PROVOCATIONS, Provoked
-from tools.command import end, heading, line, options, rms
+from tools.command import end, heading, line, options, results_of, rms
 
 DIRECTIONS_RAD = ((-0.8, -0.2), (0.0, -0.4), (0.7, -0.7))
 RANGES_M = (2.0, 6.0, 10.0)

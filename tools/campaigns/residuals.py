@@ -27,7 +27,6 @@ from calib.geometry.cahvor import CameraModel
 from calib.geometry.rigid import FloatArray
 from drivers.sim.rover import RoverModel
 from drivers.simulation_clock import MAX
-from mastctl.cli.experiment import results_of
 from mastctl.client import Client, ClientError, Snapshot
 from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon
@@ -35,7 +34,7 @@ from mastctl.devices.frames import camera_and_sequence
 from mastctl.experiment.simulated import simulated_config
 from mastctl.experiment.targets import BORDER_PX
 from mastctl.packaged import config_folder
-from tools.command import end, options, rms, show
+from tools.command import end, options, results_of, rms, show
 
 DAYS = {"kind": "default.yaml", "worst": "worst_day.yaml"}
 GROUPS = ("rocks", "ground")

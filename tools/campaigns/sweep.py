@@ -23,14 +23,13 @@ import numpy as np
 import yaml
 
 from drivers.simulation_clock import MAX
-from mastctl.cli.experiment import results_of
 from mastctl.client import Client
 from mastctl.config import Config, load_config
 from mastctl.daemon import RunningDaemon
 from mastctl.experiment.pointing import PointingExperiment, TargetRecord, run_pointing_experiment
 from mastctl.experiment.simulated import simulation_truth
 from mastctl.packaged import config_folder
-from tools.command import end, numbers, options, rms, show
+from tools.command import end, numbers, options, results_of, rms, show
 
 SWEEPS = Path(__file__).with_name("sweeps.yaml")
 PAIR = ("navcam_left", "navcam_right")

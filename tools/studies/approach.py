@@ -28,11 +28,10 @@ from calib.matching.search import seen_by
 from calib.matching.track import Track, moved_track, start_track
 from drivers.sim.placed import SceneSettings
 from drivers.sim.scene import build_scene
-from mastctl.cli.experiment import results_of
 from mastctl.experiment.targets import texture_mask
 from mastctl.motion.pairs import choose_pairs
 from mastctl.packaged import config_folder
-from tools.command import end, options, show
+from tools.command import end, options, results_of, show
 from tools.studies.approach_world import ApproachWorld, WorldErrors
 
 START_M, END_M = 10.0, 1.0

@@ -16,10 +16,9 @@ import numpy as np
 from calib.files.mast_file import load_rig
 from calib.geometry.rig import Rig
 from calib.geometry.rigid import FloatArray
-from mastctl.cli.experiment import results_of
 from mastctl.cli.options import at_least
 from mastctl.packaged import config_folder
-from tools.command import end, options, show
+from tools.command import end, options, results_of, show
 from tools.studies.calibration_survey import (
     DISTANCES_M,
     HANDOFFS,

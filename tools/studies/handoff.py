@@ -21,14 +21,14 @@ from calib.files.mast_file import load_rig
 from calib.matching.handoff import handoff_bias
 from mastctl.cli import output
 from mastctl.cli.daemon import DAEMON, client_of
-from mastctl.cli.experiment import results_of, run_bar
+from mastctl.cli.experiment import run_bar
 from mastctl.cli.options import add_options, at_least
 from mastctl.cli.output import check_folder
 from mastctl.client import Client
 from mastctl.config import load_config
 from mastctl.drift.handoffs import handoff_log, line_of
 from mastctl.experiment.simulated import Rover, running_rover, simulation_truth
-from tools.command import end, options, show
+from tools.command import end, options, results_of, show
 from tools.studies.handoff_run import STEPS, HandoffRecord, run_handoff_experiment
 
 PAPER_WORST_PX: Mapping[str, float] = {"pancam to navcam": 2.5, "navcam to hazcam": 4.0}

@@ -96,7 +96,7 @@ def test_a_measured_print_has_other_sizes_and_is_not_drawn_over(
 BAD = {
     "of another kind": (
         ["--kind", "charuco", "--tag-mm", "30"],
-        "--tag-mm is not for a board of kind charuco",
+        "a board of kind charuco, tag_m: unknown key",
     ),
     "too large": (["--kind", "charuco", "--columns", "9", "--rows", "5"], "--square-mm 19.3 would fit"),
     "suffix": (["--kind", "dots", "--out", "board.png"], "ending in .pdf"),
