@@ -28,6 +28,7 @@ CHEAP = [
     "tools.campaigns.coverage bench --cases 1 --head driven --attitudes 8 --checks 3",
     "tools.campaigns.detection --cases 1 --kind dots",
     "tools.campaigns.handoff --cases 2 --good 1",
+    "tools.campaigns.panorama --cases 1",
     "tools.campaigns.provocations survey --cases 3",
     "tools.campaigns.provocations bench --only ids",
     "tools.campaigns.residuals --cases 1 --day kind",
@@ -40,8 +41,8 @@ CHEAP = [
     "tools.studies.handoff --simulated --targets 1",
 ]
 
-ELSEWHERE = {"tools.dist", "tools.simulated.mast"}
-"""Run by test_packaging and test_simulated_mast."""
+ELSEWHERE = {"tools.dist", "tools.simulated.mast", "tools.against_others.spheres"}
+"""Run by test_packaging and test_simulated_mast; the last needs Hugin, which no test installs."""
 
 
 def cited() -> Iterator[tuple[str, str, str]]:
