@@ -125,13 +125,6 @@ class Steps:
             finally:
                 self._record, self.last = record, name
 
-    def stop_whatever_happened(self) -> None:
-        """Stop the mast whatever happened; what stops it must not hide why."""
-        try:
-            self._devices.stop()
-        except Exception as error:
-            log.error("the head did not confirm the stop: %s: %s", type(error).__name__, error)
-
     def check_not_stopped(self) -> None:
         """Pass unless the request was cancelled. Raises PointingError ``stopped``."""
         if self._cancelled.is_set():

@@ -111,7 +111,6 @@ class PanoramaTaker(Steps):
                 detail.update(seams=None if whole is None else as_json(whole))
                 detail.update(slip=None if slip is None else slip.sentence)
         except BaseException as error:
-            self.stop_whatever_happened()
             end = {"state": "ended", "reason": " ".join(str(error).split()) or type(error).__name__}
             with suppress(BadFile):  # of a full disk; the error says so already
                 folder.save(folder.index.model_copy(update=end))
