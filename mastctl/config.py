@@ -389,6 +389,6 @@ def parse_address(text: str) -> Listen:
         host, port = parts.hostname, parts.port
     except ValueError:
         host = port = None
-    if not host or port is None or "@" in text or not text.isprintable():
+    if not host or port is None or set(text) & set("@?#") or not text.isprintable():
         raise ValueError(f"'{text[:80]}' where HOST:PORT (127.0.0.1:8420, [::1]:8420) or a path is expected")
     return Listen(host=host, port=port)

@@ -85,6 +85,12 @@ def test_an_address_is_read_as_a_command_takes_it(text: str, url: str) -> None:
     assert parse_address(text).url == url
 
 
+@pytest.mark.parametrize("text", ["rover.local", "127.0.0.1:8420?x", "127.0.0.1:8420#x", "ana@rover.local:80"])
+def test_an_address_with_more_than_host_and_port_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="HOST:PORT"):
+        parse_address(text)
+
+
 def test_listen_may_be_left_out_or_be_a_socket() -> None:
     assert parsed(changed("listen", ...)).listen.url == "http://127.0.0.1:8420"
     assert (
