@@ -85,7 +85,9 @@ def test_an_address_is_read_as_a_command_takes_it(text: str, url: str) -> None:
     assert parse_address(text).url == url
 
 
-@pytest.mark.parametrize("text", ["rover.local", "127.0.0.1:8420?x", "127.0.0.1:8420#x", "ana@rover.local:80"])
+@pytest.mark.parametrize(
+    "text", ["rover.local", "127.0.0.1:8420?x", "127.0.0.1:8420#x", "ana@rover.local:80"]
+)
 def test_an_address_with_more_than_host_and_port_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="HOST:PORT"):
         parse_address(text)
