@@ -166,7 +166,7 @@ class KeepOuts:
                 (place[0] + share * (pan - place[0]), place[1] + share * (tilt - place[1]))
                 for pan, tilt in most.corners
             )
-            span = Span.around(low, high)
+            span = Span.around(low, high) if part < SPAN_PARTS else most
             if not any(span.enters(full) for full in self.full):
                 return span
         return None

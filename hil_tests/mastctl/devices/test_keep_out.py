@@ -165,4 +165,7 @@ def test_the_free_span_about_a_place_has_it_and_no_keep_out() -> None:
         assert room.overlap(most) == room and Span.around(here, *room.corners) == room
         for corner in room.corners:  # each move in it goes out
             keep_outs.check_move(Span.around(here), corner, True)
+        wide = Span((-2.6, 2.6), (-1.2, 0.5))
+        free_of_all = KeepOuts((), 0.0, (0.0, 0.0), wide.pan_rad, wide.tilt_rad)
+        assert free_of_all.free_span(here, wide) == wide, "a limit is met, not passed by rounding"
     assert 50 < found < 250
