@@ -140,11 +140,11 @@ def calibrate(
     ``former`` the rig to compare with there. Raises SurveyNotFitted if the fit finds no good minimum: nothing
     is written; else as `conclude`.
     """
-    calibration = FITS[method](survey, mast_parameters)
+    calibration = _testable(FITS[method](survey, mast_parameters))
     jointly: Calibration | CalibError | None = None
     if method != "joint":
         try:
-            jointly = fit_joint(survey, mast_parameters)
+            jointly = _testable(fit_joint(survey, mast_parameters))
         except CalibError as error:
             jointly = error
     verdict = judge(survey, calibration, warnings, [name for name, _ in undetected], jointly)
@@ -153,6 +153,11 @@ def calibrate(
     own = {"warnings": sentences, "undetected": [f"{name}: {reason}" for name, reason in undetected]}
     saved = conclude(survey, calibration, verdict, rig, out, report, former, **own)
     return Calibrated(survey, calibration, verdict, sentences, undetected, *saved)
+
+
+def _testable(fit: Calibration) -> Calibration:
+    """Without wider models where the survey leaves something open: what they gain there is by chance."""
+    return replace(fit, wider=()) if fit.degenerate else fit
 
 
 def conclude(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from mastctl.calibration.landing import (
     pointing_change,
     pointing_error_px,
 )
+from mastctl.calibration.run import FITS, calibrate
 from mastctl.calibration.verdict import judge
 
 DRAWS = 100
@@ -105,6 +107,19 @@ def test_the_worst_reason_decides(fitted: tuple[Survey, Calibration]) -> None:
     bad = judge(survey, replace(calibration, checks=off))
     assert bad.grade == "bad"
     assert any(r.grade == "bad" and "check images of navcam_left" in r.sentence for r in bad.reasons)
+
+
+def test_a_survey_that_leaves_something_open_blames_no_joint(
+    fitted: tuple[Survey, Calibration], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    survey, fit = fitted
+    chance = replace(fit.wider[0], significant=True, sentence="tilt slipped")
+    left_open = Degenerate(("mast.translation_m.z",), "tilt hardly moved")
+    opened = replace(fit, degenerate=(left_open,), wider=(chance,))
+    monkeypatch.setitem(FITS, "joint", lambda survey, mast_parameters: opened)
+    made = calibrate(survey, tmp_path / "mast.yaml")
+    assert made.verdict.grade == "bad"
+    assert "tilt slipped" not in (tmp_path / "mast.yaml").read_text()
 
 
 @pytest.mark.parametrize(("count", "first_too"), [(1, False), (2, False), (2, True)])
