@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from mastctl import signals
 from mastctl.cli import output
+from mastctl.cli.geometry import read_mast_file
 from mastctl.cli.options import at_least, command, finite_number, one_of, option
 from mastctl.cli.output import (
     Answer,
@@ -25,7 +26,6 @@ from mastctl.cli.output import (
     check_file,
     check_folder,
     tables_at,
-    unusable,
 )
 
 if TYPE_CHECKING:
@@ -97,7 +97,6 @@ def _calibrate(args: argparse.Namespace) -> Answer:
 def _refine(args: argparse.Namespace) -> Answer:
     """Propose a correction by hand-offs as a new mast file; 1, and no file, if they show none."""
     from calib.errors import NoCorrection
-    from calib.files.mast_file import load_rig
     from mastctl.calibration.run import refine, save_new
     from mastctl.drift.handoffs import read_log
 
@@ -108,9 +107,7 @@ def _refine(args: argparse.Namespace) -> Answer:
     if args.out.resolve() in {path.resolve() for path in (args.survey, *args.refine)}:
         raise WrongUse(f"--out {args.out} is what is read; name another file, for the proposal")
     check_file(args.out, "--out")
-    mast = load_rig(args.survey)
-    for note in mast.notes:
-        output.show_line(note)
+    mast = read_mast_file(args.survey)
     document, found = refine(mast, [read_log(path) for path in args.refine])
     shown: list[str | Shown] = [
         *tables_at(document, REFINED),
@@ -152,7 +149,7 @@ def _from_survey(args: argparse.Namespace) -> Answer:
         raise
     check_file(args.out, "--out")  # before the minutes of the search, not after them
     if args.out.is_file() and args.out.resolve().is_relative_to(survey.folder.resolve()):
-        raise unusable(f"--out {args.out}", "is a file of the survey itself; name another one")
+        raise WrongUse(f"--out {args.out}: is a file of the survey itself; name another one")
     check_folder(args.report, "--report")
     in_use = _in_use(args)
     undetected: tuple[tuple[str, str], ...] = ()

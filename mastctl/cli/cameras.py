@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
@@ -237,6 +238,4 @@ def opened_camera(args: argparse.Namespace) -> Iterator[tuple[Camera, tuple[int,
 
 def with_cameras(config: Config, names: Iterable[str]) -> HardwareSettings:
     """Return the configuration's hardware with these cameras only."""
-    from dataclasses import replace
-
     return replace(config.hardware, cameras={name: config.hardware.cameras[name] for name in names})

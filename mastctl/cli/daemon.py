@@ -110,6 +110,13 @@ def followed(client: Client, operation_id: str, as_json: bool, timeout_s: float)
         raise
 
 
+def not_done(record: OperationAnswer, more: str = "") -> CommandError:
+    """Return the error of an operation that ended as failed or stopped, with ``more`` after its message."""
+    message = f"operation {record['id']} ended as {record['state']}"
+    error = record["error"] or {"code": record["state"], "message": message}
+    return CommandError(error["code"], f"{error['message']}{more}", detail={"operation": record})
+
+
 @command(
     "stop",
     option("--without-daemon", "of a head whose daemon is dead: stop on the servo line of --config"),

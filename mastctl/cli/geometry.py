@@ -68,7 +68,7 @@ def triangulate_pair(args: argparse.Namespace) -> Answer:
     from calib.geometry.covariance import clicked_point, stored_covariance
 
     stored = read_mast_file(args.mast)
-    rig, pair = stored.rig, stored.rig.stereo[named(args.pair, stored.rig.stereo, stored.path, "stereo pair")]
+    rig, pair = stored.rig, _pair(stored, args.pair)
     for name in pair:
         need_joints(rig, name, args)
     seen, _ = clicked_point(
@@ -107,10 +107,7 @@ def hand_over(args: argparse.Namespace) -> Answer:
     from calib.geometry.handoff import Joints, hand_off
 
     stored = read_mast_file(args.mast)
-    rig, pair = (
-        stored.rig,
-        stored.rig.stereo[named(args.source, stored.rig.stereo, stored.path, "stereo pair")],
-    )
+    rig, pair = stored.rig, _pair(stored, args.source)
     named(args.to, [*rig.stereo, *rig.cameras], args.mast, "stereo pair or camera")
     to = rig.stereo.get(args.to, (args.to,))
     for name in (*pair, *to):
@@ -166,6 +163,10 @@ def named(name: str | None, known: Collection[str], where: Path | None, kind: st
         hint = nearest(name, list(known)) if known else "it has none"
         raise WrongUse(f"no {kind} '{name}' in {where}; {hint}")
     return name
+
+
+def _pair(stored: StoredRig, name: str) -> tuple[str, str]:
+    return stored.rig.stereo[named(name, stored.rig.stereo, stored.path, "stereo pair")]
 
 
 def need_joints(rig: Rig, name: str, args: argparse.Namespace) -> None:
@@ -346,7 +347,7 @@ def camera_maps(args: argparse.Namespace) -> Answer:
         if args.camera is not None:
             raise WrongUse("--camera and --pair: one of them is expected")
         stored = read_mast_file(args.file)
-        names = stored.rig.stereo[named(args.pair, stored.rig.stereo, stored.path, "stereo pair")]
+        names = _pair(stored, args.pair)
         left, right = (stored.rig.cameras[one] for one in names)
         if left.on != right.on:
             raise WrongUse(f"'{args.pair}' is a pair of two mounts; both on one are expected")

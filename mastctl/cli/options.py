@@ -45,11 +45,6 @@ def not_negative(text: str) -> float:
     return _number(text, "zero or more", lambda value: value >= 0)
 
 
-def angle_rad(text: str) -> float:
-    """Read a value as an angle of at most a full turn, radians (argparse ``type``)."""
-    return _number(text, "an angle of at most 6.28 radians", lambda value: abs(value) <= math.tau)
-
-
 def at_least(least: int) -> Callable[[str], int]:
     """Return what reads a value as a whole number of at least ``least`` (argparse ``type``)."""
 

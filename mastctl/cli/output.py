@@ -239,9 +239,9 @@ def check_file(path: Path, option: str) -> None:
     """Refuse a file that cannot be written. Raises CommandError."""
     target = path.resolve()
     if target.exists() and not target.is_file():
-        raise unusable(f"{option} {path}", "is a folder or a device; a file is expected")
+        raise WrongUse(f"{option} {path}: is a folder or a device; a file is expected")
     if not target.parent.is_dir():
-        raise unusable(f"{option} {path}", f"there is no folder {path.parent}; make it first")
+        raise WrongUse(f"{option} {path}: there is no folder {path.parent}; make it first")
     check_folder(target.parent, f"{option} {path}:")
 
 
@@ -257,9 +257,4 @@ def check_folder(path: Path | None, option: str) -> None:
             pass
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
-        raise unusable(f"{option} {path}", f"nothing can be written to {folder}: {reason}") from None
-
-
-def unusable(what: str, why: str) -> CommandError:
-    """Return the refusal of a place where a command cannot write."""
-    return CommandError("file_system", f"{what}: {why}", exit_code=2)
+        raise WrongUse(f"{option} {path}: nothing can be written to {folder}: {reason}") from None

@@ -8,8 +8,7 @@ import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli import output
-from mastctl.cli.daemon import DAEMON, client_of, followed
+from mastctl.cli.daemon import DAEMON, client_of, followed, not_done
 from mastctl.cli.options import GROUPS, command, finite_number, one_of, option
 from mastctl.cli.output import Answer, CommandError, Shown, WrongUse, check_file
 
@@ -58,11 +57,7 @@ def _take(args: argparse.Namespace) -> Answer:
             _bring(client, name, out)
     index = _index(out)
     if record["state"] != "done":
-        error = record["error"] or {"code": record["state"], "message": f"it ended as {record['state']}"}
-        raise CommandError(
-            error["code"],
-            f"{error['message']}; what was taken is in {out}: 'panorama take --resume {out}' goes on",
-        )
+        raise not_done(record, f"; what was taken is in {out}: 'panorama take --resume {out}' goes on")
     return Answer(_document(index), _shown(out, index))
 
 
@@ -78,11 +73,8 @@ def _bring(client: Client, name: str, out: Path) -> None:
         path = out / file
         if file in frames and is_plain_file(path) and digest_of(path.read_bytes()) == frames[file]:
             continue
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(client.panorama_file(name, file))
-        except OSError as error:
-            raise output.unusable(str(path), f"cannot be written: {error.strerror or error}") from None
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(client.panorama_file(name, file))
 
 
 @command("panorama show", FOLDER, help="say what a panorama holds", example="panorama")

@@ -7,9 +7,9 @@ import time
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from mastctl.cli.daemon import DAEMON, TIMEOUT, client_of, followed
-from mastctl.cli.options import angle_rad, command, finite_number, one_of, option
-from mastctl.cli.output import Answer, CommandError, WrongUse, cell, chosen
+from mastctl.cli.daemon import DAEMON, TIMEOUT, client_of, followed, not_done
+from mastctl.cli.options import command, finite_number, one_of, option
+from mastctl.cli.output import Answer, WrongUse, cell, chosen
 from mastctl.cli.requests import TRACK
 from mastctl.cli.service import operation_shown
 
@@ -32,7 +32,7 @@ FRAME = option("--frame rover|site", "frame of --position (default rover)")
         PIXEL,
         CAMERA,
         POSITION,
-        option("--angles PAN TILT", "joint angles, radians", type=angle_rad),
+        option("--angles PAN TILT", "joint angles, radians"),
         option("--rates PAN TILT", "jog: turn at these, rad/s, until Ctrl-C or --seconds"),
         required=True,
     ),
@@ -125,9 +125,7 @@ def _done(args: argparse.Namespace, client: Client, operation_id: str) -> Operat
     record = followed(client, operation_id, args.json, args.timeout)
     if record["state"] == "done":
         return record
-    message = f"operation {record['id']} ended as {record['state']}"
-    error = record["error"] or {"code": record["state"], "message": message}
-    raise CommandError(error["code"], error["message"], detail={"operation": record})
+    raise not_done(record)
 
 
 def _jog(args: argparse.Namespace) -> Answer:

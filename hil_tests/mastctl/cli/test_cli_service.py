@@ -111,7 +111,7 @@ def test_a_failed_operation_ends_with_1_and_its_reason(run: Run, monkeypatch: py
         (("point", "--angles", "0", "1.5"), "outside_limits"),
         (("point", "--angles", "0", "nan"), "wrong_use"),
         (("point", "--pixel", "navcam_left", "f", "1", "2"), "frame_unknown"),
-        (("snapshot", "navcam_left", "--out", "no/such/folder/x.png"), "file_system"),
+        (("snapshot", "navcam_left", "--out", "no/such/folder/x.png"), "wrong_use"),
     ],
 )
 def test_wrong_use_and_bad_input_end_with_2(
