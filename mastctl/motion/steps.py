@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -28,7 +27,6 @@ from mastctl.motion.measurement import (
 )
 from mastctl.motion.requests import PixelTarget, PointingError, clicked_frame
 
-log = logging.getLogger(__name__)
 
 POLL_S = 0.02  # between readings while the head moves
 DWELL_S = 0.15
