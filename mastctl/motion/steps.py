@@ -27,7 +27,6 @@ from mastctl.motion.measurement import (
 )
 from mastctl.motion.requests import PixelTarget, PointingError, clicked_frame
 
-
 POLL_S = 0.02  # between readings while the head moves
 DWELL_S = 0.15
 """How long the reading must stay the same: three exposures, and longer than a mast's ringing after the axis
