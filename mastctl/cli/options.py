@@ -11,6 +11,8 @@ from __future__ import annotations
 import argparse
 import math
 import re
+import shutil
+import textwrap
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
@@ -189,6 +191,15 @@ def add_options(parser: Any, *options: Option | OneOf) -> None:
 _NEGATIVE_NUMBER = re.compile(r"^-(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?$|^-(?:inf|infinity|nan)$", re.IGNORECASE)
 
 
+def _wrapped(line: str, width: int) -> str:
+    if len(line) <= width + 1:
+        return line
+    indent = " " * (len(line) - len(line.lstrip()) + 1)
+    return (
+        textwrap.fill(line.replace(",", ", "), width, subsequent_indent=indent, break_long_words=False) + "\n"
+    )
+
+
 class Parser(argparse.ArgumentParser):
     """A parser that refuses in one line, reads any negative number, and gives each command --json."""
 
@@ -202,6 +213,11 @@ class Parser(argparse.ArgumentParser):
             default=argparse.SUPPRESS,
             help="print one JSON document on stdout and nothing else",
         )
+
+    def format_help(self) -> str:
+        """Return the help within the terminal's width: argparse breaks no group of options and no choices."""
+        width = shutil.get_terminal_size().columns - 1
+        return "".join(_wrapped(line, width) for line in super().format_help().splitlines(keepends=True))
 
     def error(self, message: str) -> NoReturn:
         """Refuse wrong use; the caller prints the one line."""

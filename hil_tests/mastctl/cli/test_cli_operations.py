@@ -106,11 +106,14 @@ def leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]
             yield from leaves(below)
 
 
-def test_the_help_of_each_command_shows_an_example_that_it_takes() -> None:
+def test_the_help_of_each_command_shows_an_example_that_it_takes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
     parser = build_parser()
     known = {leaf.prog.removeprefix("mastctl "): leaf for leaf in leaves(parser)}
     assert set(DECLARED) == set(known)
     for words, command in DECLARED.items():
         example = f"mastctl {words} {command.example}".rstrip()
-        assert f"example: {example}" in " ".join(known[words].format_help().split()), words
+        help = known[words].format_help()
+        assert f"example: {example}" in " ".join(help.split()), words
+        assert max(map(len, help.splitlines())) < 80, words
         assert "run" in parser.parse_args(_joined(shlex.split(example)[1:])[0]), example
