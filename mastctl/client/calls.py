@@ -91,7 +91,7 @@ class Calls:
         return self.daemon.command(answers.Started, "POST", "/panoramas", given(**wanted))["id"]
 
     def panorama(self, name: str) -> dict[str, Any]:
-        """Return a panorama's index (``mastctl/panorama/2``)."""
+        """Return a panorama's index (``mastctl/panorama/1``)."""
         return self.daemon.json(dict[str, Any], "GET", f"/panoramas/{escaped(name)}")
 
     def panorama_file(self, name: str, file: str) -> bytes:

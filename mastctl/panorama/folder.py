@@ -1,6 +1,6 @@
 """A panorama's folder: an index, pictures with their facts, the mast file, the mosaic and a preview.
 
-    index.yaml     schema mastctl/panorama/2: what was wanted, each view, the mosaic, its seams
+    index.yaml     schema mastctl/panorama/1: what was wanted, each view, the mosaic, its seams
     mast.yaml      the mast file by which it was taken
     frames/        NNN-CAMERA.png, as the cameras gave them
     mosaic.png     composed by the mast file alone; preview.jpg, 2048 pixels wide at most
@@ -36,7 +36,7 @@ from mastctl.devices.frames import StampedFrame
 from mastctl.frame_facts import FrameFacts
 from mastctl.report.pictures import encoded
 
-SCHEMA: Literal["mastctl/panorama/2"] = "mastctl/panorama/2"
+SCHEMA: Literal["mastctl/panorama/1"] = "mastctl/panorama/1"
 INDEX, MAST, MOSAIC, PREVIEW = "index.yaml", "mast.yaml", "mosaic.png", "preview.jpg"
 PREVIEW_PX = 2048
 MOST_BYTES = 1 << 28
@@ -102,7 +102,7 @@ class MosaicRecord(Record):
 class Index(Record):
     """``index.yaml``. ``cameras``: the one that the mosaic is made of first, then its partner."""
 
-    schema_: Literal["mastctl/panorama/2"] = Field(alias="schema")
+    schema_: Literal["mastctl/panorama/1"] = Field(alias="schema")
     id: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]{0,60}$")]
     time: Moment
     cameras: Annotated[list[CameraName], Field(min_length=1, max_length=2)]

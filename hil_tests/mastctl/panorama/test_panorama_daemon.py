@@ -402,10 +402,6 @@ def test_a_steep_field_has_views_inside_it(repository: Path, tilt_rad: tuple[flo
 def test_a_folder_that_is_none_is_refused_in_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(BadFile, match=r"index\.yaml"):
         Folder(tmp_path)
-    for number, reason in (
-        (1, "'mastctl/panorama/1' where 'mastctl/panorama/2' is"),
-        (2, "the key is missing"),
-    ):
-        (tmp_path / "index.yaml").write_text(f"schema: mastctl/panorama/{number}\nid: x\n")
-        with pytest.raises(BadFile, match=reason):
-            Folder(tmp_path)
+    (tmp_path / "index.yaml").write_text("schema: mastctl/panorama/1\nid: x\n")
+    with pytest.raises(BadFile, match="the key is missing"):
+        Folder(tmp_path)
