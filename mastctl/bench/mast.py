@@ -88,6 +88,8 @@ class BenchInterrupted(MastctlError):
 class NoLight(BenchInterrupted):
     """Every camera's image at an attitude is too dark, or too bright, to be used; elsewhere it may do."""
 
+    code = BenchInterrupted.code
+
 
 @dataclass(frozen=True, eq=False)
 class SeenBoard:

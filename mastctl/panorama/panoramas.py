@@ -30,8 +30,7 @@ from mastctl.panorama.take import PanoramaTaker, grid_of
 
 FOLDER = "panoramas"
 HOLDER = "panoramas"
-KEPT = 8
-"""Frames of panoramas that were clicked last stay at hand."""
+KEPT = 8  # frames of panoramas that were clicked last stay at hand
 MOST = 100
 """So many panoramas are kept; the next is refused until one is deleted."""
 

@@ -18,8 +18,7 @@ from mastctl.web.commands import Here, command, file_of, whole_file
 from mastctl.web.keeping import PlaceName
 
 Panorama = Annotated[str, Path(pattern=r"^[A-Za-z0-9][A-Za-z0-9-]{0,60}$", description="a panorama's id")]
-WAY_S = 60.0
-"""A view's move, its pictures, and those taken once more."""
+VIEW_S = 60.0  # its move, its pictures, and those taken once more
 
 
 class PanoramaBody(StrictBody):
@@ -72,7 +71,7 @@ def add_panoramas(app: FastAPI) -> None:
         "POST /panoramas",
         Command("panorama", steers=True, need="motion"),
         status_code=202,
-        usual_s=lambda here, body: 400 * WAY_S + usual_s(here.service.config.limits, 0),
+        usual_s=lambda here, body: 400 * VIEW_S + usual_s(here.service.config.limits, 0),
     )
     def take(body: PanoramaBody, here: Here) -> Started:
         """Take a panorama, or what an earlier one lacks."""
