@@ -13,6 +13,7 @@ from fastapi.requests import HTTPConnection
 from fastapi.responses import JSONResponse
 from pydantic.fields import FieldInfo
 from starlette.exceptions import HTTPException
+from starlette.routing import Match
 
 from calib.errors import CalibError
 from calib.files.records import mistakes_in, schema_of
@@ -145,7 +146,12 @@ def add_errors(app: FastAPI) -> None:
             405: ("method_not_allowed", f"{request.method} is not possible at {path}"),
             413: ("too_large", error.detail),
         }.get(error.status_code, ("bad_request", error.detail))
-        return error_response(error.status_code, code, message, headers=error.headers)
+        headers = dict(error.headers or {})
+        if error.status_code == 405:  # the router names those of its first route at the path alone
+            matching = [one for one in app.routes if one.matches(request.scope)[0] is not Match.NONE]
+            methods = {method for one in matching for method in getattr(one, "methods", None) or ()}
+            headers |= {"Allow": ", ".join(sorted(methods))} if methods else {}
+        return error_response(error.status_code, code, message, headers=headers)
 
 
 def _sentences(line: HTTPConnection, errors: Sequence[Any]) -> list[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,14 +30,6 @@ PAUSE_S = 1e-3
 TRIES = 2
 IN_A_ROW = 3
 """So many views in a row that fail are no longer the views' fault."""
-
-
-@dataclass(frozen=True)
-class PanoramaResult:
-    """What came of taking one: its id, and how many views have which state."""
-
-    panorama: str
-    views: dict[str, int]
 
 
 def grid_of(rig: Rig, camera: str, pan_rad: Pair, tilt_rad: Pair, overlap: float) -> list[Pair]:
@@ -89,8 +80,8 @@ class PanoramaTaker(Steps):
 
     _fixed = False
 
-    def take(self, folder: Folder, devices: Devices) -> PanoramaResult:
-        """Take, keep and compose; the folder has all that was taken, whatever happens.
+    def take(self, folder: Folder, devices: Devices) -> dict[str, Any]:
+        """Take, keep and compose; return id and counts. The folder has all that was taken, whatever happens.
 
         Raises PointingError ``stopped``, the error of three views in a row, BadFile if the disk refuses.
         """
@@ -117,7 +108,8 @@ class PanoramaTaker(Steps):
             raise
         folder.save(folder.index.model_copy(update={"state": "done"}))
         states = [view.state for view in folder.index.views]
-        return PanoramaResult(folder.index.id, {state: states.count(state) for state in sorted(set(states))})
+        counts = {state: states.count(state) for state in sorted(set(states))}
+        return {"panorama": folder.index.id, "views": counts}
 
     def _view(
         self, folder: Folder, number: int, fix: Callable[[Any], Any], devices: Devices

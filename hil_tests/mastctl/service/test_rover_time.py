@@ -50,7 +50,7 @@ def a_run(seed: int, pause_s: float) -> tuple[str, list[np.ndarray[Any, Any]]]:
             pictures.append(frame.image)
             request = PointRequest(pixel=PixelTarget("navcam_left", frame.frame_id, u_px, v_px))
             outcome.append(ended(service, service.steering.point(request).id))
-            time.sleep(pause_s)
+        until(lambda: service.drift.verdict()["pointings"] == len(pictures), "both pointings count")
         outcome.append(service.status())
     return json.dumps(outcome, sort_keys=True), pictures
 

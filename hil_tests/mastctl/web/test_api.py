@@ -151,8 +151,7 @@ def test_what_is_no_good_json_does_not_get_far(
     ("method", "path", "status", "code"),
     [
         ("GET", "/api/v1/nothing", 404, "not_found"),
-        ("GET", "/api/v1/point", 405, "method_not_allowed"),
-        ("GET", "/api/v1/operations/", 404, "not_found"),
+        ("PUT", "/api/v1/session", 405, "method_not_allowed"),
         ("GET", "/api/v1/operations/000001-ffff", 404, "operation_unknown"),
         ("GET", "/api/v1/snapshot/navcam_center", 404, "unknown_camera"),
         ("GET", "/api/v1/snapshot/navcam_left?format=gif", 422, "bad_request"),
@@ -164,7 +163,9 @@ def test_what_is_no_good_json_does_not_get_far(
 def test_other_refusals_have_the_one_form(
     quiet: httpx.Client, method: str, path: str, status: int, code: str
 ) -> None:
-    refused(quiet.request(method, f"{quiet.base_url.copy_with(path='')}{path}"), status, code)
+    answer = quiet.request(method, f"{quiet.base_url.copy_with(path='')}{path}")
+    refused(answer, status, code)
+    assert answer.headers.get("Allow", "DELETE, GET, POST") == "DELETE, GET, POST"
 
 
 def test_angles_beyond_the_limits_are_refused_at_once(quiet: httpx.Client) -> None:
