@@ -217,12 +217,6 @@ def test_a_mosaic_too_large_is_refused_and_a_long_lens_gets_what_fits(whole_rig:
     assert ahead[0] == pytest.approx(width / 2, rel=0.02), "the cut is behind"
 
 
-@pytest.mark.parametrize("px_per_rad", [0.0, -5.0, math.nan, 1e-3])
-def test_a_resolution_that_is_none_is_refused(whole_rig: Rig, px_per_rad: float) -> None:
-    with pytest.raises(CalibError, match="or more are expected"):
-        canvas_of(views(whole_rig), Rigid.identity(), MosaicSurface.of("infinity"), px_per_rad=px_per_rad)
-
-
 @pytest.mark.parametrize("tilt_rad", [1.4, -1.4])
 def test_a_view_of_straight_up_or_down_is_whole_on_the_canvas(whole_rig: Rig, tilt_rad: float) -> None:
     camera = whole_rig.camera_in_rover("navcam_left", 0.3, tilt_rad)

@@ -380,7 +380,7 @@ def test_the_command_brings_the_folder_shows_composes_exports_and_points(
     pixel = record["request"]["pixel"]
     np.testing.assert_allclose([pixel["x_px"], pixel["y_px"]], clicked, atol=1e-6)
     assert main(["panorama", "keep", "stone", "--operation", record["id"], *url]) == 0
-    assert main(["panorama", "targets", "--out", f"{kept}.txt", *url]) == 2
+    assert main(["panorama", "targets", "--out", f"{out}.txt", *url]) == 2
     assert main(["panorama", "targets", "--out", f"{out}.csv", *url]) == 0
     assert main(["panorama", "targets", "--out", f"{out}.json", *url]) == 0
     assert re.match(r"name,frame,x_m.*\nstone,site,.*\[\[", Path(f"{out}.csv").read_text())
