@@ -108,7 +108,8 @@ class Panoramas:
             if body.resume is None:
                 shutil.rmtree(folder.path, ignore_errors=True)
             raise
-        self._begun_s[folder.index.id] = began_s
+        if body.resume is None:  # the views of one that goes on may be of another place
+            self._begun_s[folder.index.id] = began_s
         return begun
 
     def _planned(self, rig: Rig, body: Any, digest: str) -> Index:
@@ -155,7 +156,7 @@ class Panoramas:
         return {"panoramas": found}
 
     def began_s(self, name: str) -> float:
-        """Return when one was begun, or gone on with, by this clock; -inf for one of an earlier run."""
+        """Return when one was begun, by this clock; -inf for one of an earlier run."""
         return self._begun_s.get(name, -math.inf)
 
     def slip(self, mast_digest: str) -> str:

@@ -196,8 +196,7 @@ class Stopping:
 def latch_faults(latch: Latch) -> Iterator[StandingFault]:
     """Yield what keeps an emergency stop from outliving the daemon, where it should."""
     if latch.not_kept and not latch.folder.is_temporary:
-        where = "is kept in memory only" if latch.entries else "would not survive a restart"
-        message = f"an emergency stop {where}: {latch.not_kept}"
+        message = f"an emergency stop is kept in memory only: {latch.not_kept}"
         yield StandingFault(
             "state", "latch_not_kept", message, latch.since_s, "the disk takes it, or a reset"
         )

@@ -299,16 +299,16 @@ def test_a_killed_daemons_panorama_goes_on_in_the_next(rover: Path, tmp_path: Pa
         assert "not the picture" in refused(
             "unreadable", lambda: client.daemon.request("GET", f"/panoramas/{index['id']}/picture")
         )
+        for x_m in (0.0, 1.0):
+            client.pose((x_m, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
         record, index = taken(client, resume=index["id"])
+        refused("rover_moved", lambda: preview(client, index))
     assert record["state"] == "done" and all(view["state"] == "taken" for view in index["views"])
     left = {name: one for name, one in config.hardware.cameras.items() if name == "navcam_left"}
     config = replace(config, hardware=replace(config.hardware, cameras=left))
     with RunningDaemon(config) as daemon, Client(daemon.url) as client:
         refused("unknown_camera", lambda: client.take_panorama(resume=index["id"]))
         assert preview(client, index)["range_from"] == "surface"
-        for x_m in (0.0, 1.0):
-            client.pose((x_m, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0))
-        refused("rover_moved", lambda: preview(client, index))
         path_of = f"/panoramas/{index['id']}"
         assert client.request("DELETE", path_of) == {"panoramas": []} and not path.exists()
         refused("panorama_unknown", lambda: client.request("DELETE", path_of))
